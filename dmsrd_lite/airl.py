@@ -1,0 +1,197 @@
+"""Adversarial inverse reinforcement learning (AIRL) for many demonstrations at once.
+
+``D(s, a, s') = e^f / (e^f + pi(a|s))`` with ``f = g(s) + gamma h(s') - h(s)``, so the discriminator's logit is
+``f - log pi(a|s)``. Paper: section "Preliminaries"; Fu, Luo, Levine (2018).
+"""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dmsrd_lite.demonstrations import DemonstrationSet
+from dmsrd_lite.envs import Domain, InputError
+from dmsrd_lite.networks import BatchedMLP, GaussianPolicies, to_tensor
+from dmsrd_lite.policy_optimization import PolicyOptimizer, PPOSettings, clone_behavior
+from dmsrd_lite.rollouts import Rollouts, rollout
+
+POLICY_REWARDS = ("g", "f_minus_log_pi")
+
+
+@dataclass(frozen=True)
+class AIRLSettings:
+    n_iterations: int = 30
+    episodes: int = 8  # per strategy and iteration
+    discount: float = 0.99  # gamma, in f and for the policy
+    policy_reward: str = "g"  # "g" as in the paper, or "f_minus_log_pi" = log D - log(1 - D)
+    warm_start: bool = True  # start from behavioural cloning (the paper: off)
+    cloning_weight: float = 0.3  # weight of the demonstration's negative log-likelihood in the policy loss (the paper: 0)
+    cloning_steps: int = 2000
+    coverage: bool = True  # half of the discriminator's policy samples come from wide exploratory rollouts (the paper: off)
+    coverage_episodes: int = 2  # of the untrained policy and of the clone at each noise level
+    coverage_noise: tuple[float, ...] = (1.0, 3.0, 10.0)  # sigma of the clone times this
+    discriminator_steps: int = 8
+    discriminator_batch: int = 512  # demonstration samples per strategy and step, and as many others
+    discriminator_rate: float = 1e-3
+    replay_iterations: int = 10  # policy samples of so many iterations are kept
+    replay_samples: int = 2000  # per strategy and iteration
+    reward_average: float = 0.9  # decay of the running average of the reward's weights; 0 keeps the last iterate
+    ppo: PPOSettings = PPOSettings(learning_rate=3e-4)
+
+
+class Rewards(torch.nn.Module):
+    """``g_j(s)`` and the shaping term ``h_j(s)`` of M strategies, each an MLP (32, 32) of the state."""
+
+    def __init__(self, domain: Domain, n_strategies: int, discount: float, seed):
+        super().__init__()
+        self.domain, self.discount = domain, discount
+        sizes = (domain.obs_dim, 32, 32, 1)
+        self.strategy_reward = BatchedMLP(n_strategies, sizes, [*_list(seed), 0])
+        self.shaping = BatchedMLP(n_strategies, sizes, [*_list(seed), 1])
+
+    def g(self, x: torch.Tensor) -> torch.Tensor:
+        """``g_j(s)``: network inputs (M, n, obs_dim) -> (M, n)."""
+        return self.strategy_reward(x)[..., 0]
+
+    def f(self, x: torch.Tensor, x_next: torch.Tensor) -> torch.Tensor:
+        """``g(s) + gamma h(s') - h(s)``, (M, n)."""
+        return self.g(x) + self.discount * self.shaping(x_next)[..., 0] - self.shaping(x)[..., 0]
+
+    @torch.no_grad()
+    def evaluate(self, observations: np.ndarray) -> np.ndarray:
+        """``g_j`` at raw observations (..., obs_dim), the same for all strategies: (M, ...)."""
+        x = to_tensor(self.domain.network_input(observations)).view(1, -1, self.domain.obs_dim)
+        m = self.strategy_reward.n_strategies
+        return self.g(x.expand(m, -1, -1)).numpy().reshape(m, *observations.shape[:-1])
+
+
+def _list(seed) -> list[int]:
+    return list(seed) if isinstance(seed, list | tuple) else [seed]
+
+
+def discriminator_loss(demonstration_logits: torch.Tensor, sample_logits: torch.Tensor) -> torch.Tensor:
+    """``-E_demo[log D] - E_samples[log(1 - D)]`` per strategy from logits (M, n): (M,) nats."""
+    softplus = torch.nn.functional.softplus
+    return softplus(-demonstration_logits).mean(1) + softplus(sample_logits).mean(1)
+
+
+class AIRL:
+    """One batched AIRL model per demonstration; ``train`` yields a record per iteration.
+
+    After training: ``policies`` (GaussianPolicies), ``rewards`` (the last iterate), ``averaged_rewards`` (the running
+    average, to be used), ``clone`` (Actor of behavioural cloning), ``steps`` per strategy so far.
+    """
+
+    def __init__(self, demonstrations: DemonstrationSet, settings: AIRLSettings, seed: int, n_threads: int = 0):
+        if settings.policy_reward not in POLICY_REWARDS:
+            raise InputError(f"policy_reward {settings.policy_reward!r}: expected one of {', '.join(POLICY_REWARDS)}")
+        self.domain, self.settings, self.seed, self.n_threads = demonstrations.domain, settings, seed, n_threads
+        self.horizon = demonstrations.horizon
+        states, actions, successors = demonstrations.transitions()
+        self.x, self.x_next = (to_tensor(self.domain.network_input(s)) for s in (states, successors))
+        self.actions = to_tensor(actions)
+        m = demonstrations.n_demonstrations
+        untrained = GaussianPolicies(self.domain, m, [seed, 0])
+        cloned = GaussianPolicies(self.domain, m, [seed, 0])
+        self.cloning_curve = clone_behavior(cloned, self.x, self.actions, [seed, 1], n_steps=settings.cloning_steps)
+        self.clone, self.untrained = cloned.actor(), untrained.actor()
+        self.policies = cloned if settings.warm_start else untrained
+        self.rewards = Rewards(self.domain, m, settings.discount, [seed, 2])
+        self.averaged_rewards = Rewards(self.domain, m, settings.discount, [seed, 2])
+        self.optimizer = PolicyOptimizer(self.policies, settings.ppo, [seed, 3])
+        self.reward_optimizer = torch.optim.Adam(self.rewards.parameters(), lr=settings.discriminator_rate, fused=True)
+        self.replay: deque = deque(maxlen=settings.replay_iterations)
+        self.coverage: list = []
+        self.steps = self.iteration = 0
+
+    def train(self, progress=iter) -> Iterator[dict]:
+        """Run the iterations that are left; ``progress`` wraps the range (``tqdm`` for a bar).
+
+        record: iteration; steps (per strategy, coverage included); discriminator_loss, accuracy and environment_return
+        (M,) each - the return is for reading only and trains nothing; seconds by part.
+        """
+        if self.settings.coverage and not self.coverage:
+            self._explore()
+        for self.iteration in progress(range(self.iteration, self.settings.n_iterations)):
+            clock = [time.perf_counter()]
+            seeds = [[self.seed, part, self.iteration] for part in (10, 11, 12, 13)]
+            data = rollout(self.domain, self.policies.actor(), self.settings.episodes, seeds[0],
+                           horizon=self.horizon, n_threads=self.n_threads)
+            self.steps += data.n_steps // len(self.x)
+            clock.append(time.perf_counter())
+            self.replay.append(self._samples(data, self.policies.actor(), self.settings.replay_samples, seeds[1]))
+            loss, accuracy = self._discriminate(seeds[2])
+            self._average()
+            clock.append(time.perf_counter())
+            demonstrations = (self.x, self.actions)
+            self.optimizer.update(data, self.policy_rewards(data), seeds[3], demonstrations=demonstrations,
+                                  cloning_weight=self.settings.cloning_weight)
+            clock.append(time.perf_counter())
+            yield {"iteration": self.iteration, "steps": self.steps, "discriminator_loss": loss, "accuracy": accuracy,
+                   "environment_return": data.returns.mean(1),
+                   "seconds": dict(zip(("rollouts", "discriminator", "policy"), np.diff(clock), strict=True))}
+        self.iteration = self.settings.n_iterations
+
+    def policy_rewards(self, data: Rollouts) -> np.ndarray:
+        """What the policy is paid at each step of ``data``: ``g(s')`` of the state reached, or ``f - log pi``; (M, E, T)."""
+        m, e, t = data.rewards.shape
+        x = to_tensor(self.domain.network_input(data.observations)).view(m, e, t + 1, -1)
+        before, after = (part.reshape(m, e * t, -1) for part in (x[:, :, :-1], x[:, :, 1:]))
+        with torch.no_grad():
+            if self.settings.policy_reward == "g":
+                return self.rewards.g(after).view(m, e, t).numpy()
+            actions = to_tensor(data.executed_actions).view(m, e * t, -1)
+            return (self.rewards.f(before, after) - self.policies.log_density(before, actions)).view(m, e, t).numpy()
+
+    def _samples(self, data: Rollouts, actor, n_samples: int, seed) -> tuple[torch.Tensor, ...]:
+        """``n_samples`` transitions per strategy: x, x', and the log-density they were drawn with."""
+        m, e, t = data.rewards.shape
+        flat = np.sort(np.random.default_rng(seed).permutation(e * t)[:n_samples])
+        episode, step = np.divmod(flat, t)
+        states, successors = data.observations[:, episode, step], data.observations[:, episode, step + 1]
+        log_pi = actor.log_density(states, self.domain.clip_action(data.actions[:, episode, step]))
+        return (*(to_tensor(self.domain.network_input(s)) for s in (states, successors)), to_tensor(log_pi))
+
+    def _explore(self) -> None:
+        """Coverage: rollouts of the untrained policy and of the clone at several noise levels, made once."""
+        s, everyone = self.settings, range(len(self.x))
+        for level, actor in enumerate([self.untrained, *(self.clone.select(everyone, factor) for factor in s.coverage_noise)]):
+            data = rollout(self.domain, actor, s.coverage_episodes, [self.seed, 4, level], horizon=self.horizon,
+                           n_threads=self.n_threads)
+            self.steps += data.n_steps // len(self.x)
+            self.coverage.append(self._samples(data, actor, s.replay_samples, [self.seed, 5, level]))
+
+    @staticmethod
+    def _joined(sources) -> list[torch.Tensor]:
+        return [torch.cat([s[i] for s in sources], 1) for i in range(3)]
+
+    def _discriminate(self, seed) -> tuple[np.ndarray, np.ndarray]:
+        """Cross-entropy steps on demonstrations against samples; returns loss and accuracy (M,) of the last step."""
+        s, rng = self.settings, np.random.default_rng(seed)
+        with torch.no_grad():
+            log_pi = self.policies.log_density(self.x, self.actions)  # of the demonstrations, under the current policy
+        pools = [self._joined(self.replay)] + ([self._joined(self.coverage)] if s.coverage else [])
+        for _ in range(s.discriminator_steps):
+            pick = torch.from_numpy(rng.integers(0, self.x.shape[1], s.discriminator_batch))
+            demonstration = self.rewards.f(self.x[:, pick], self.x_next[:, pick]) - log_pi[:, pick]
+            drawn = []
+            for pool in pools:
+                some = torch.from_numpy(rng.integers(0, pool[0].shape[1], s.discriminator_batch // len(pools)))
+                drawn.append([part[:, some] for part in pool])
+            x, x_next, density = (torch.cat(parts, 1) for parts in zip(*drawn, strict=True))
+            samples = self.rewards.f(x, x_next) - density
+            loss = discriminator_loss(demonstration, samples)
+            self.reward_optimizer.zero_grad()
+            loss.sum().backward()
+            self.reward_optimizer.step()
+        accuracy = ((demonstration > 0).float().mean(1) + (samples < 0).float().mean(1)) / 2
+        return loss.detach().numpy().copy(), accuracy.numpy()
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        decay = self.settings.reward_average if self.iteration else 0.0
+        for mean, now in zip(self.averaged_rewards.parameters(), self.rewards.parameters(), strict=True):
+            mean.mul_(decay).add_(now, alpha=1 - decay)

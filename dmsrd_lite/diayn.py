@@ -1,0 +1,173 @@
+"""Demonstrators by joint training on task reward + diversity (DIAYN): ``r + lambda (log q(z|s) - log 1/M)``."""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dmsrd_lite.demonstrations import SCHEMA_VERSION, DemonstrationSet, check_folder, save_demonstrations, write_atomically
+from dmsrd_lite.divergence import trajectory_divergences
+from dmsrd_lite.envs import Domain, InputError
+from dmsrd_lite.networks import BatchedMLP, GaussianPolicies, to_tensor
+from dmsrd_lite.policy_optimization import PolicyOptimizer, PPOSettings
+from dmsrd_lite.rollouts import Rollouts, draw_reset_seeds, rollout
+
+
+@dataclass(frozen=True)
+class DiaynSettings:
+    n_strategies: int = 14  # more than are kept: the most distinct of the successful ones are chosen
+    n_iterations: int = 160
+    episodes: int = 8  # per strategy and iteration at the full horizon; more of them while episodes are short
+    first_horizon: int = 100  # steps; grows to the domain's horizon over the first ``growing`` of the iterations
+    growing: float = 0.6
+    diversity_weight: float = 0.03  # lambda
+    blur: tuple[float, ...] = ()  # noise on what q(z|s) sees, per coordinate of the network input; () is none
+    discriminator_steps: int = 20
+    discriminator_batch: int = 200
+    discriminator_rate: float = 1e-3
+    ppo: PPOSettings = PPOSettings()
+
+
+class StrategyDiscriminator:
+    """``q(z|s)``: which of M strategies visited the state s."""
+
+    def __init__(self, domain: Domain, n_strategies: int, settings: DiaynSettings, seed):
+        self.settings = settings
+        self.network = BatchedMLP(1, (domain.obs_dim, 64, 64, n_strategies), seed)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=settings.discriminator_rate, fused=True)
+
+    def update(self, x: torch.Tensor, seed) -> float:
+        """Cross-entropy steps on states x (M, n, obs_dim); returns the accuracy on the last batch."""
+        rng, s = np.random.default_rng(seed), self.settings
+        labels = torch.arange(x.shape[0]).repeat_interleave(s.discriminator_batch)
+        for _ in range(s.discriminator_steps):
+            pick = torch.from_numpy(rng.integers(0, x.shape[1], s.discriminator_batch))
+            logits = self.network(self._blurred(x[:, pick], rng).reshape(1, -1, x.shape[2]))[0]
+            self.optimizer.zero_grad()
+            torch.nn.functional.cross_entropy(logits, labels).backward()
+            self.optimizer.step()
+        return float((logits.argmax(1) == labels).float().mean())
+
+    def _blurred(self, x: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+        if not self.settings.blur:
+            return x
+        return x + to_tensor(rng.standard_normal(x.shape, dtype=np.float32) * np.array(self.settings.blur))
+
+    @torch.no_grad()
+    def log_probability(self, x: torch.Tensor, seed) -> np.ndarray:
+        """``log q(z = j | s)`` for the states x[j], (M, n, obs_dim) -> (M, n)."""
+        m, n, d = x.shape
+        x = self._blurred(x, np.random.default_rng(seed))
+        log_q = torch.log_softmax(self.network(x.reshape(1, m * n, d))[0], 1).view(m, n, m)
+        return log_q[torch.arange(m), :, torch.arange(m)].numpy()
+
+
+def train_demonstrators(domain: Domain, settings: DiaynSettings, seed: int, n_threads: int = 0) -> Iterator[dict]:
+    """Train M demonstrators together; yields one record per iteration, with the policies as they are then.
+
+    record: ``policies`` (live, copy with ``.actor()``), ``iteration``, ``horizon``, ``task_return`` (M,) per ``horizon``
+    steps, ``accuracy`` of q(z|s), ``steps`` so far in all.
+    """
+    m = settings.n_strategies
+    policies = GaussianPolicies(domain, m, [seed, 0])
+    optimizer = PolicyOptimizer(policies, settings.ppo, [seed, 1])
+    discriminator = StrategyDiscriminator(domain, m, settings, [seed, 2])
+    steps = 0
+    for iteration in range(settings.n_iterations):
+        share = min(1.0, iteration / max(1, settings.growing * settings.n_iterations))
+        horizon = int(settings.first_horizon * (domain.horizon / settings.first_horizon) ** share)
+        episodes = max(settings.episodes, min(4 * settings.episodes, settings.episodes * domain.horizon // (2 * horizon)))
+        data = rollout(domain, policies.actor(), episodes, [seed, 3, iteration], horizon=horizon, n_threads=n_threads)
+        x = to_tensor(domain.network_input(data.observations[:, :, 1:])).view(m, episodes * horizon, -1)
+        accuracy = discriminator.update(x, [seed, 4, iteration])
+        diversity = discriminator.log_probability(x, [seed, 10, iteration]).reshape(m, episodes, horizon) + np.log(m)
+        optimizer.update(data, data.rewards + settings.diversity_weight * diversity, [seed, 5, iteration])
+        steps += data.n_steps
+        yield {"policies": policies, "iteration": iteration, "horizon": horizon, "steps": steps,
+               "task_return": data.returns.mean(1), "accuracy": accuracy}
+
+
+def most_distinct(divergences: np.ndarray, n_kept: int) -> list[int]:
+    """Greedy choice of ``n_kept`` strategies: again and again drop one of the closest pair, the one nearer to the rest.
+
+    divergences (m, m): the diagonal is not read, a pair's distance is the smaller of its two directions.
+    """
+    distance = np.minimum(divergences, divergences.T).astype(float)
+    np.fill_diagonal(distance, np.inf)
+    left = list(range(len(distance)))
+    while len(left) > n_kept:
+        sub = distance[np.ix_(left, left)]
+        pair = np.unravel_index(sub.argmin(), sub.shape)
+        left.pop(min(pair, key=lambda i: tuple(np.sort(sub[i]))))
+    return left
+
+
+def _demonstration_set(domain: Domain, actor, data: Rollouts, metadata: dict) -> DemonstrationSet:
+    m, k, t = data.rewards.shape
+    executed = data.executed_actions
+    log_pi = actor.log_density(data.observations[:, :, :-1].reshape(m, k * t, -1), executed.reshape(m, k * t, -1))
+    return DemonstrationSet(domain, data.observations, executed, data.rewards, np.arange(m), data.reset_seeds,
+                            log_pi.reshape(m, k, t).astype(np.float64).sum(-1), metadata)
+
+
+def generate_demonstrations(domain: Domain, seed: int, folder: Path, *, settings: DiaynSettings | None = None,
+                            n_kept: int = 10, n_trajectories: int = 3, progress=iter) -> dict:
+    """Train demonstrators, keep the most distinct of the successful ones, write their demonstrations and a second take.
+
+    Success: ten trial episodes all return at least ``domain.success_return`` and none fails. Returns the choice as
+    written into the files' metadata; ``InputError`` when fewer than ``n_kept`` succeed (nothing is written then).
+    """
+    settings = settings or DiaynSettings()
+    takes = {take: check_folder(Path(folder) / f"{domain.name}_{take}.npz") for take in ("demonstrations", "second_take")}
+    for record in progress(train_demonstrators(domain, settings, seed)):
+        pass
+    actor = record["policies"].actor()
+    trial = rollout(domain, actor, 10, [seed, 6])
+    failed = domain.failed(trial.observations).any(1) | (trial.returns < domain.success_return).any(1)
+    successful = np.flatnonzero(~failed)
+    if len(successful) < n_kept:
+        raise InputError(f"only {len(successful)} of {settings.n_strategies} demonstrators of {domain.name} with seed {seed} "
+                         f"succeeded; expected {n_kept}: train longer or take another seed")
+    table = np.array([[trajectory_divergences(domain, trial.observations[i, :3], trial.observations[j, 3:6]).mean()
+                       for j in successful] for i in successful])
+    kept = successful[most_distinct(table, n_kept)]
+    chosen = table[np.ix_(np.isin(successful, kept), np.isin(successful, kept))]
+    choice = {"trained": settings.n_strategies, "successful": successful.tolist(), "kept": kept.tolist(),
+              "smallest_divergence": round(float(chosen[~np.eye(n_kept, dtype=bool)].min()), 3),
+              "largest_own_divergence": round(float(np.diag(chosen).max()), 3)}
+    metadata = {"seed": seed, "choice": choice, "settings": dataclasses.asdict(settings),
+                "made_by": f"python -m dmsrd_lite generate {domain.name} --seed {seed}"}
+    actor = actor.select(kept)
+    reset_seeds = draw_reset_seeds(np.random.default_rng([seed, 7]), n_kept, n_trajectories)
+    for number, (take, path) in enumerate(takes.items()):
+        data = rollout(domain, actor, n_trajectories, [seed, 8, number], reset_seeds=reset_seeds)
+        save_demonstrations(path, _demonstration_set(domain, actor, data, {**metadata, "take": take}))
+    return choice
+
+
+def generate_test_set(domain: Domain, seed: int, path: Path, *, settings: DiaynSettings | None = None,
+                      n_snapshots: int = 100, n_episodes: int = 10, stride: int = 10, progress=iter) -> Path:
+    """Trajectories of ten new policies at ``n_snapshots`` moments of a separate training, from failure to success.
+
+    Writes ``observations`` (n, T/stride, obs_dim) in half precision, ``returns``, ``policy``, ``snapshot``, ``metadata``.
+    """
+    path = check_folder(path)
+    settings = settings or DiaynSettings(n_strategies=10, n_iterations=120)
+    moments = set(np.linspace(0, settings.n_iterations - 1, n_snapshots).astype(int).tolist())
+    states, returns = [], []
+    for record in progress(train_demonstrators(domain, settings, seed)):
+        if record["iteration"] in moments:
+            data = rollout(domain, record["policies"].actor(), n_episodes, [seed, 9, record["iteration"]])
+            states.append(data.observations[:, :, stride::stride].reshape(-1, domain.horizon // stride, domain.obs_dim).astype(np.float16))
+            returns.append(data.returns.reshape(-1))
+    policy = np.tile(np.repeat(np.arange(settings.n_strategies), n_episodes), len(states))
+    snapshot = np.repeat(np.arange(len(states)), settings.n_strategies * n_episodes)
+    metadata = {"domain": domain.name, "schema_version": SCHEMA_VERSION, "stride": stride, "seed": seed,
+                "settings": dataclasses.asdict(settings)}
+    return write_atomically(path, lambda f: np.savez_compressed(
+        f, observations=np.concatenate(states), returns=np.concatenate(returns).astype(np.float32),
+        policy=policy.astype(np.uint8), snapshot=snapshot.astype(np.uint8), metadata=np.array(json.dumps(metadata))))

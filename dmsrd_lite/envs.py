@@ -1,0 +1,157 @@
+"""Domains: what a task is (``Domain``) and many copies of it at once (``make_batch``).
+
+Everything else in the package takes a ``Domain``; a new task is one more description in ``DOMAINS``.
+"""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+class InputError(ValueError):
+    """Input that cannot be used; the message is one sentence: what, where, what was expected."""
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A task with a fixed horizon that never ends early (shared by all modules and notebooks).
+
+    ``make_batch(n_environments, n_threads)`` returns an object with
+    ``reset(seeds (n,)) -> observations (n, obs_dim)`` and
+    ``step(actions (n, action_dim)) -> observations (n, obs_dim), rewards (n,)``; actions must lie in the bounds.
+    """
+
+    name: str
+    title: str
+    horizon: int  # steps of every episode
+    seconds_per_step: float
+    observation_names: tuple[str, ...]  # with units
+    action_names: tuple[str, ...]
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+    observation_low: tuple[float, ...]  # networks see observations clipped to these bounds; files stay raw
+    observation_high: tuple[float, ...]
+    observation_scale: tuple[float, ...]  # ... and divided by this
+    reward_text: str
+    failure_text: str  # the word used in tables, e.g. "falls"
+    failed: Callable[[np.ndarray], np.ndarray]  # observations (..., T, obs_dim) -> (...,) bool
+    make_batch: Callable[[int, int], object]
+    draw_frame: Callable[[np.ndarray], np.ndarray]  # one observation -> (height, width, 3) uint8
+    phase_axes: tuple[int, int]  # the two observations that show a strategy best
+    success_return: float  # a demonstrator reaches at least this
+    knn_resolution: float  # distances below this are the noise of the recording (divergence)
+    kl_margin: float  # demonstrators of different strategies are at least this many nats apart
+
+    @property
+    def obs_dim(self) -> int:
+        return len(self.observation_names)
+
+    @property
+    def action_dim(self) -> int:
+        return len(self.action_names)
+
+    def network_input(self, observations: np.ndarray) -> np.ndarray:
+        """What a network sees: ``clip(s, low, high) / scale`` as float32, same shape as ``observations``."""
+        x = np.clip(observations, self.observation_low, self.observation_high)
+        return (x / np.asarray(self.observation_scale)).astype(np.float32)
+
+    def clip_action(self, actions: np.ndarray) -> np.ndarray:
+        """The executed action: ``clip(a, low, high)``, same shape."""
+        return np.clip(actions, self.action_low, self.action_high)
+
+
+class PendulumBatch:
+    """``n_environments`` inverted pendulums on MuJoCo's own thread pool.
+
+    Two physics steps of 0.02 s are one control step; the reward is ``-|theta|`` (rad) of the new state.
+    The start is uniform in +-0.01 in all four coordinates, drawn as Gymnasium's ``InvertedPendulum-v5`` draws it,
+    so a reset seed means the same there and here. The bits do not depend on ``n_threads`` (0: all cores).
+    """
+
+    def __init__(self, n_environments: int, n_threads: int = 0):
+        import mujoco
+        from gymnasium.envs import mujoco as gymnasium_mujoco
+        from mujoco.batch import Batch
+
+        folder = os.path.join(os.path.dirname(gymnasium_mujoco.__file__), "assets")
+        model = mujoco.MjModel.from_xml_path(os.path.join(folder, "inverted_pendulum.xml"))
+        self._batch = Batch(model, n_environments, n_threads)
+        self._position, self._velocity, self._control = (self._batch.bind(f) for f in ("qpos", "qvel", "ctrl"))
+
+    def reset(self, seeds: np.ndarray) -> np.ndarray:
+        self._batch.reset(stage=0)
+        start = np.array([np.random.default_rng(int(seed)).uniform(-0.01, 0.01, 4) for seed in seeds])
+        self._position[:], self._velocity[:] = start[:, :2], start[:, 2:]
+        return start
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self._control[:] = actions
+        self._batch.step(nstep=2)
+        return np.concatenate([self._position, self._velocity], axis=1), -np.abs(self._position[:, 1])
+
+
+def draw_pendulum(observation: np.ndarray, height: int = 120, width: int = 240) -> np.ndarray:
+    """Cart and pole drawn from the state (x in m, theta in rad), so that no GL library is needed: (height, width, 3)."""
+    from PIL import Image, ImageDraw
+
+    x, theta = float(observation[0]), float(observation[1])
+    factor = 2  # drawn twice as large, then reduced: smooth edges
+    image = Image.new("RGB", (width * factor, height * factor), "white")
+    draw = ImageDraw.Draw(image)
+    metre = width * factor / 2.9
+    base_x, base_y = width * factor / 2 + x * metre, height * factor * 0.72
+    rail = [width * factor / 2 - 1.05 * metre, width * factor / 2 + 1.05 * metre]
+    draw.line([rail[0], base_y, rail[1], base_y], fill="#999999", width=3 * factor)
+    draw.line([width * factor / 2, base_y + 8 * factor, width * factor / 2, base_y + 14 * factor], fill="#999999", width=factor)
+    draw.rounded_rectangle([base_x - 0.13 * metre, base_y - 8 * factor, base_x + 0.13 * metre, base_y + 8 * factor],
+                           radius=4 * factor, fill="#0072B2")
+    tip = (base_x + 0.6 * metre * np.sin(theta), base_y - 0.6 * metre * np.cos(theta))
+    draw.line([base_x, base_y, *tip], fill="#D55E00", width=5 * factor)
+    draw.ellipse([tip[0] - 4 * factor, tip[1] - 4 * factor, tip[0] + 4 * factor, tip[1] + 4 * factor], fill="#D55E00")
+    return np.asarray(image.resize((width, height), Image.LANCZOS))
+
+
+INVERTED_PENDULUM = Domain(
+    name="inverted_pendulum",
+    title="Inverted Pendulum",
+    horizon=1000,
+    seconds_per_step=0.04,
+    observation_names=("x (m)", "theta (rad)", "xdot (m/s)", "thetadot (rad/s)"),
+    action_names=("force (control units)",),
+    action_low=(-3.0,),
+    action_high=(3.0,),
+    observation_low=(-2.0, -2.0, -10.0, -20.0),
+    observation_high=(2.0, 2.0, 10.0, 20.0),
+    observation_scale=(1.0, 1.0, 2.0, 4.0),
+    reward_text="-|theta| of the new state, in rad, every step",
+    failure_text="falls",
+    failed=lambda observations: (np.abs(observations[..., 1]) > 1.0).any(axis=-1),
+    make_batch=PendulumBatch,
+    draw_frame=draw_pendulum,
+    phase_axes=(0, 2),
+    success_return=-60.0,
+    knn_resolution=1e-9,
+    kl_margin=3.0,
+)
+
+DOMAINS = {domain.name: domain for domain in (INVERTED_PENDULUM,)}
+
+
+def get_domain(name: str) -> Domain:
+    """The ``Domain`` called ``name``; ``InputError`` for a name that is not in ``DOMAINS``."""
+    if name not in DOMAINS:
+        raise InputError(f"unknown domain {name!r}: expected one of {', '.join(DOMAINS)}")
+    return DOMAINS[name]
+
+
+def check_seed(seed: object, minimum: int = 0) -> int:
+    """``seed`` as an int, or ``InputError`` when it is no whole number of at least ``minimum``."""
+    try:
+        value = int(str(seed))
+    except ValueError:
+        raise InputError(f"seed {seed!r}: expected a whole number of at least {minimum}") from None
+    if value < minimum:
+        raise InputError(f"seed {seed!r}: expected a whole number of at least {minimum}")
+    return value

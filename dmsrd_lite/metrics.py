@@ -1,0 +1,59 @@
+"""The metrics of every table: one function scores every method in the same way."""
+
+import numpy as np
+
+from dmsrd_lite.demonstrations import DemonstrationSet, RewardTestSet
+from dmsrd_lite.divergence import demonstration_divergence, own_divergence
+from dmsrd_lite.networks import SIGMA_FLOOR
+from dmsrd_lite.rollouts import rollout
+
+
+def demonstration_log_likelihood(actor, demonstrations: DemonstrationSet) -> np.ndarray:
+    """``sum_t log pi_j(a_t|s_t)`` of demonstration j's executed actions under policy j, mean over its trajectories: (n,) nats.
+
+    With the policy's own sigma, at least ``SIGMA_FLOOR``. The demonstrator's own is ``demonstrations.log_likelihoods.mean(1)``.
+    """
+    n, k, t = demonstrations.actions.shape[:3]
+    states = demonstrations.observations[:, :, :t].reshape(n, k * t, -1)
+    log_pi = actor.log_density(states, demonstrations.actions.reshape(n, k * t, -1), SIGMA_FLOOR)
+    return log_pi.astype(np.float64).sum(1) / k
+
+
+def divergence_floor(demonstrations: DemonstrationSet, second_take: DemonstrationSet | None = None) -> np.ndarray:
+    """The KL that the demonstrator reaches against its own demonstration: (n,) nats.
+
+    From the second take where there is one, else from the demonstration's own trajectories against each other.
+    """
+    domain, shown = demonstrations.domain, demonstrations.observations
+    if second_take is None:
+        return np.array([own_divergence(domain, d) for d in shown])
+    return np.array([demonstration_divergence(domain, a, b) for a, b in zip(shown, second_take.observations, strict=True)])
+
+
+def score_policies(actor, demonstrations: DemonstrationSet, seed, *, n_rollouts: int = 20, n_compared: int = 10,
+                   n_threads: int = 0) -> dict[str, np.ndarray]:
+    """Score policy j against demonstration j by stochastic rollouts; each value is (n,).
+
+    environment_return: mean undiscounted return. failure_share: share of rollouts that fail. divergence: KL in nats,
+    every trajectory of the demonstration against each of the first ``n_compared`` rollouts. log_likelihood_per_step:
+    nats per step of the demonstration.
+    """
+    domain = demonstrations.domain
+    data = rollout(domain, actor, n_rollouts, seed, horizon=demonstrations.horizon, n_threads=n_threads)
+    pairs = zip(demonstrations.observations, data.observations[:, :n_compared], strict=True)
+    return {
+        "environment_return": data.returns.mean(1),
+        "failure_share": domain.failed(data.observations).mean(1),
+        "divergence": np.array([demonstration_divergence(domain, d, r) for d, r in pairs]),
+        "log_likelihood_per_step": demonstration_log_likelihood(actor, demonstrations) / demonstrations.horizon,
+    }
+
+
+def reward_correlation(trajectory_rewards: np.ndarray, returns: np.ndarray) -> float:
+    """Pearson correlation of mean rewards (n,) with true returns (n,)."""
+    return float(np.corrcoef(trajectory_rewards, returns)[0, 1])
+
+
+def correlations_on(test_set: RewardTestSet, rewards) -> np.ndarray:
+    """Correlation of each learned reward (anything with ``evaluate``) with the true return on a test set, (M,)."""
+    return np.array([reward_correlation(mean, test_set.returns) for mean in rewards.evaluate(test_set.observations).mean(2)])

@@ -1,0 +1,111 @@
+"""Small networks for many strategies at once: every weight has a leading strategy axis."""
+
+import math
+
+import numpy as np
+import torch
+
+from dmsrd_lite.envs import Domain
+
+torch.set_num_threads(1)  # small batched networks: one thread is faster, and the bits never depend on the machine's cores
+
+LOG_2PI = math.log(2 * math.pi)
+SIGMA_FLOOR = 0.02  # of the action's own unit: no policy gets narrower, and no likelihood is counted with less
+
+
+class BatchedMLP(torch.nn.Module):
+    """M networks side by side: ``y[j] = W3[j] tanh(W2[j] tanh(W1[j] x[j] + b1[j]) + b2[j]) + b3[j]``.
+
+    Input (M, n, n_in), output (M, n, n_out). Orthogonal start; ``last_gain`` scales the last layer.
+    """
+
+    def __init__(self, n_strategies: int, sizes: tuple[int, ...], seed: int | list[int], last_gain: float = 1.0):
+        super().__init__()
+        rng = np.random.default_rng(seed)
+        self.weights, self.biases = torch.nn.ParameterList(), torch.nn.ParameterList()
+        for layer, (n_in, n_out) in enumerate(zip(sizes, sizes[1:], strict=False)):
+            gain = last_gain if layer == len(sizes) - 2 else math.sqrt(2)
+            q = np.linalg.qr(rng.standard_normal((n_strategies, max(n_in, n_out), min(n_in, n_out))))[0]
+            q = q if n_in >= n_out else q.transpose(0, 2, 1)
+            self.weights.append(torch.nn.Parameter(torch.tensor(gain * q, dtype=torch.float32).contiguous()))
+            self.biases.append(torch.nn.Parameter(torch.zeros(n_strategies, 1, n_out)))
+
+    @property
+    def n_strategies(self) -> int:
+        return self.weights[0].shape[0]
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = torch.tanh(torch.baddbmm(bias, x, weight))
+        return torch.baddbmm(self.biases[-1], x, self.weights[-1])
+
+
+def gaussian_log_density(actions, mean, sigma):
+    """``log N(a | mu, sigma^2)`` summed over the last axis; NumPy arrays or tensors, in nats."""
+    log = torch.log if isinstance(sigma, torch.Tensor) else np.log
+    return (-0.5 * (((actions - mean) / sigma) ** 2 + LOG_2PI) - log(sigma)).sum(-1)
+
+
+class GaussianPolicies(torch.nn.Module):
+    """M policies ``pi_j(a|s) = N(mu_j(s), sigma_j^2)``, ``mu_j`` an MLP (32, 32), ``sigma_j`` learned and state-free.
+
+    Means and sigmas are in the action's own units.
+    """
+
+    def __init__(self, domain: Domain, n_strategies: int, seed: int | list[int], sigma: float = 0.3,
+                 hidden: tuple[int, ...] = (32, 32)):
+        super().__init__()
+        self.domain = domain
+        self.network = BatchedMLP(n_strategies, (domain.obs_dim, *hidden, domain.action_dim), seed, last_gain=0.01)
+        half_range = (np.array(domain.action_high) - np.array(domain.action_low)) / 2
+        self.log_sigma = torch.nn.Parameter(
+            torch.tensor(np.log(sigma * half_range), dtype=torch.float32).repeat(n_strategies, 1, 1))
+
+    @property
+    def n_strategies(self) -> int:
+        return self.network.n_strategies
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Network inputs (M, n, obs_dim) -> means (M, n, action_dim), sigmas (M, 1, action_dim)."""
+        return self.network(x), self.log_sigma.exp()
+
+    def log_density(self, x: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """``log pi_j(a|s)``: x (M, n, obs_dim), actions (M, n, action_dim) -> (M, n) in nats."""
+        return gaussian_log_density(actions, *self(x))
+
+    def actor(self) -> "Actor":
+        """A frozen NumPy copy to act with: far less overhead per simulator step than a tensor library."""
+        copy = [[p.detach().numpy().copy() for p in group] for group in (self.network.weights, self.network.biases)]
+        return Actor(self.domain, *copy, self.log_sigma.detach().exp().numpy())
+
+
+class Actor:
+    """Frozen Gaussian policies in NumPy. ``mean``: observations (M, E, obs_dim) -> (M, E, action_dim)."""
+
+    def __init__(self, domain: Domain, weights: list[np.ndarray], biases: list[np.ndarray], sigma: np.ndarray):
+        self.domain, self.weights, self.biases, self.sigma = domain, weights, biases, sigma  # sigma (M, 1, action_dim)
+
+    @property
+    def n_strategies(self) -> int:
+        return self.sigma.shape[0]
+
+    def mean(self, observations: np.ndarray) -> np.ndarray:
+        x = self.domain.network_input(observations)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = np.tanh(x @ weight + bias)
+        return x @ self.weights[-1] + self.biases[-1]
+
+    def log_density(self, observations: np.ndarray, actions: np.ndarray, sigma_floor: float = 0.0) -> np.ndarray:
+        """``log pi_j(a|s)``: (M, n, obs_dim), (M, n, action_dim) -> (M, n); sigma is at least ``sigma_floor``."""
+        return gaussian_log_density(actions, self.mean(observations), np.maximum(self.sigma, sigma_floor))
+
+    def select(self, indices, sigma_factor: float = 1.0) -> "Actor":
+        """The policies ``indices`` (repeats allowed), with every sigma times ``sigma_factor``."""
+        pick = np.asarray(indices)
+        return Actor(self.domain, [w[pick] for w in self.weights], [b[pick] for b in self.biases],
+                     self.sigma[pick] * np.float32(sigma_factor))
+
+
+def to_tensor(x: np.ndarray) -> torch.Tensor:
+    """A float32 tensor with its own contiguous memory."""
+    return torch.from_numpy(np.ascontiguousarray(x, dtype=np.float32))

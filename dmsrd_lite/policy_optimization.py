@@ -1,0 +1,137 @@
+"""Proximal policy optimisation (PPO) for many strategies at once, and behavioural cloning.
+
+PPO rather than TRPO: it is first-order and works on minibatches, so one batched gradient step serves all strategies;
+TRPO's conjugate gradient and line search would have to run for each strategy apart.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.signal import lfilter
+
+from dmsrd_lite.networks import SIGMA_FLOOR, BatchedMLP, GaussianPolicies, to_tensor
+from dmsrd_lite.rollouts import Rollouts
+
+
+@dataclass(frozen=True)
+class PPOSettings:
+    discount: float = 0.99  # gamma
+    gae_lambda: float = 0.95
+    clip: float = 0.2  # the ratio's bound
+    learning_rate: float = 1e-3
+    epochs: int = 2
+    minibatch: int = 1000  # samples per strategy and gradient step
+    sample_fraction: float = 1.0  # share of the samples that the gradient steps see in an epoch
+    value_weight: float = 0.5
+    entropy_weight: float = 0.0
+    gradient_norm: float = 1.0  # per strategy
+
+
+def generalized_advantages(rewards: np.ndarray, values: np.ndarray, discount: float, gae_lambda: float) -> np.ndarray:
+    """``A_t = sum_k (gamma lambda)^k (r_{t+k} + gamma V_{t+k+1} - V_{t+k})``, bootstrapped at the horizon.
+
+    rewards (..., T), values (..., T+1) -> (..., T). The horizon cuts an episode that would go on, so V(s_T) counts.
+    """
+    delta = rewards + discount * values[..., 1:] - values[..., :-1]
+    return lfilter([1.0], [1.0, -discount * gae_lambda], delta[..., ::-1], axis=-1)[..., ::-1]
+
+
+def clip_gradients(parameters: list[torch.Tensor], largest: float) -> None:
+    """Scale each strategy's gradient (leading axis) to a norm of at most ``largest``, apart from the others'."""
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    norm = sum(g.flatten(1).square().sum(1) for g in gradients).sqrt()
+    factor = (largest / (norm + 1e-8)).clamp(max=1.0)
+    for g in gradients:
+        g.mul_(factor.view(-1, *[1] * (g.dim() - 1)))
+
+
+class PolicyOptimizer:
+    """Batched PPO on given rewards; strategies share nothing, so training M together equals training each alone."""
+
+    def __init__(self, policies: GaussianPolicies, settings: PPOSettings, seed: int | list[int]):
+        self.policies, self.settings = policies, settings
+        d = policies.domain.obs_dim
+        self.values = BatchedMLP(policies.n_strategies, (d, 32, 32, 1), seed)
+        self.parameters = [*policies.parameters(), *self.values.parameters()]
+        self.optimizer = torch.optim.Adam(self.parameters, lr=settings.learning_rate, eps=1e-5, fused=True)
+        self._moments = None  # running mean and variance of the reward, (M, 1, 1) each
+
+    def _standardize(self, rewards: np.ndarray) -> np.ndarray:
+        """Rewards to mean 0, deviation 1 per strategy: without termination a constant changes no policy."""
+        now = np.stack([rewards.mean((1, 2), keepdims=True), rewards.var((1, 2), keepdims=True)])
+        self._moments = now if self._moments is None else 0.8 * self._moments + 0.2 * now
+        return (rewards - self._moments[0]) / np.sqrt(self._moments[1] + 1e-8)
+
+    @torch.no_grad()
+    def _evaluate(self, x: torch.Tensor, shape: tuple[int, ...]) -> np.ndarray:
+        return self.values(x).numpy().reshape(shape).astype(np.float64) / (1 - self.settings.discount)
+
+    def update(self, rollouts: Rollouts, rewards: np.ndarray, seed, *, demonstrations=None, cloning_weight: float = 0.0) -> dict:
+        """One PPO update of every policy on ``rewards`` (M, E, T), any per-step reward of these rollouts.
+
+        Loss: ``-E[min(rho A, clip(rho) A)]`` with ``rho`` the ratio at the unclipped samples, plus the value loss, minus
+        entropy, plus ``cloning_weight * E_demo[-log pi]`` when ``demonstrations = (x (M, n, d), actions (M, n, a))``.
+        Returns the mean absolute log-ratio per strategy, ``{"log_ratio": (M,)}``.
+        """
+        s, rng = self.settings, np.random.default_rng(seed)
+        m, e, t = rewards.shape
+        x_all = to_tensor(rollouts.domain.network_input(rollouts.observations)).view(m, e * (t + 1), -1)
+        values = self._evaluate(x_all, (m, e, t + 1))
+        advantages = generalized_advantages(self._standardize(rewards), values, s.discount, s.gae_lambda)
+        targets = to_tensor((advantages + values[..., :-1]) * (1 - s.discount)).view(m, -1)
+        advantages -= advantages.mean((1, 2), keepdims=True)
+        advantages = to_tensor(advantages / (advantages.std((1, 2), keepdims=True) + 1e-8)).view(m, -1)
+        x = x_all.view(m, e, t + 1, -1)[:, :, :-1].reshape(m, e * t, -1)
+        actions = to_tensor(rollouts.actions).view(m, e * t, -1)
+        with torch.no_grad():
+            old = self.policies.log_density(x, actions)
+        used = max(1, int(e * t * s.sample_fraction))
+        for _ in range(s.epochs):
+            order = torch.from_numpy(rng.permutation(e * t)[:used])
+            for start in range(0, used, s.minibatch):
+                pick = order[start : start + s.minibatch]
+                new = self.policies.log_density(x[:, pick], actions[:, pick])
+                ratio, a = (new - old[:, pick]).exp(), advantages[:, pick]
+                loss = -torch.minimum(ratio * a, ratio.clamp(1 - s.clip, 1 + s.clip) * a).mean(1).sum()
+                loss = loss + s.value_weight * (self.values(x[:, pick])[..., 0] - targets[:, pick]).square().mean(1).sum()
+                if s.entropy_weight:
+                    loss = loss - s.entropy_weight * self.policies.log_sigma.sum()
+                if cloning_weight:
+                    some = torch.from_numpy(rng.integers(0, demonstrations[0].shape[1], s.minibatch // 2))
+                    loss = loss - cloning_weight * self.policies.log_density(*(d[:, some] for d in demonstrations)).mean(1).sum()
+                self._step(loss)
+        return {"log_ratio": (new - old[:, pick]).abs().mean(1).detach().numpy()}
+
+    def _step(self, loss: torch.Tensor) -> None:
+        self.optimizer.zero_grad()
+        loss.backward()
+        clip_gradients(self.parameters, self.settings.gradient_norm)
+        self.optimizer.step()
+        with torch.no_grad():
+            self.policies.log_sigma.clamp_(min=math.log(SIGMA_FLOOR))
+
+
+def clone_behavior(policies: GaussianPolicies, x: torch.Tensor, actions: torch.Tensor, seed, *, n_steps: int = 2000,
+                   minibatch: int = 256, learning_rate: float = 3e-3) -> np.ndarray:
+    """Behavioural cloning in place: minimise ``E_demo[-log pi_j(a|s)]`` for every strategy at once.
+
+    x (M, n, obs_dim) network inputs, actions (M, n, action_dim) executed. Returns the loss every 50 steps, (k, M) nats.
+    """
+    rng = np.random.default_rng(seed)
+    optimizer = torch.optim.Adam(policies.parameters(), lr=learning_rate, fused=True)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, learning_rate, total_steps=n_steps)
+    curve = []
+    for step in range(n_steps):
+        pick = torch.from_numpy(rng.integers(0, x.shape[1], minibatch))
+        loss = -policies.log_density(x[:, pick], actions[:, pick]).mean(1)
+        optimizer.zero_grad()
+        loss.sum().backward()
+        optimizer.step()
+        schedule.step()
+        with torch.no_grad():
+            policies.log_sigma.clamp_(min=math.log(SIGMA_FLOOR))
+        if step % 50 == 0:
+            curve.append(loss.detach().numpy().copy())
+    return np.array(curve)

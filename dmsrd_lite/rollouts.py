@@ -1,0 +1,65 @@
+"""Rollouts of many policies in many environments at once: one simulator call per time step for all of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmsrd_lite.envs import Domain
+
+
+@dataclass
+class Rollouts:
+    """Episodes of M policies, E each, T steps.
+
+    observations (M, E, T+1, obs_dim) raw; actions (M, E, T, action_dim) as sampled (``domain.clip_action`` gives the
+    executed ones); rewards (M, E, T); reset_seeds (M, E).
+    """
+
+    domain: Domain
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    reset_seeds: np.ndarray
+
+    @property
+    def executed_actions(self) -> np.ndarray:
+        return self.domain.clip_action(self.actions)
+
+    @property
+    def returns(self) -> np.ndarray:
+        """Undiscounted return of each episode, (M, E)."""
+        return self.rewards.sum(-1)
+
+    @property
+    def n_steps(self) -> int:
+        return self.rewards.size
+
+
+def draw_reset_seeds(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return rng.integers(0, 2**31 - 1, shape)
+
+
+def rollout(domain: Domain, actor, n_episodes: int, seed, *, reset_seeds=None, horizon: int = 0,
+            n_threads: int = 0) -> Rollouts:
+    """Simulate ``n_episodes`` of every policy of ``actor`` (anything with ``mean``, ``sigma``, ``n_strategies``).
+
+    ``a_t = mu_j(s_t) + sigma_j eps_t``; executed is ``clip(a_t)``. ``seed`` (int or list of ints) fixes starts and
+    action noise; ``reset_seeds`` (M, E) fixes the starts alone. ``horizon`` 0 means the domain's own.
+    The same seed gives the same bits for any ``n_threads``.
+    """
+    rng = np.random.default_rng(seed)
+    m, e, t_end = actor.n_strategies, n_episodes, horizon or domain.horizon
+    drawn = draw_reset_seeds(rng, m, e)
+    reset_seeds = drawn if reset_seeds is None else np.asarray(reset_seeds)
+    noise = rng.standard_normal((t_end, m, e, domain.action_dim), dtype=np.float32) * actor.sigma
+    observations = np.empty((t_end + 1, m, e, domain.obs_dim))
+    actions = np.empty((t_end, m, e, domain.action_dim), dtype=np.float32)
+    rewards = np.empty((t_end, m, e))
+    batch = domain.make_batch(m * e, n_threads)
+    observations[0] = batch.reset(reset_seeds.ravel()).reshape(m, e, -1)
+    for t in range(t_end):
+        actions[t] = actor.mean(observations[t]) + noise[t]
+        executed = domain.clip_action(actions[t]).reshape(m * e, -1)
+        state, reward = batch.step(executed)
+        observations[t + 1], rewards[t] = state.reshape(m, e, -1), reward.reshape(m, e)
+    return Rollouts(domain, *(np.moveaxis(a, 0, 2) for a in (observations, actions, rewards)), reset_seeds)
