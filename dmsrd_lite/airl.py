@@ -115,7 +115,8 @@ class AIRL:
         """
         if self.settings.coverage and not self.coverage:
             self._explore()
-        for self.iteration in progress(range(self.iteration, self.settings.n_iterations)):
+        for iteration in progress(range(self.iteration, self.settings.n_iterations)):
+            self.iteration = iteration
             clock = [time.perf_counter()]
             seeds = [[self.seed, part, self.iteration] for part in (10, 11, 12, 13)]
             data = rollout(self.domain, self.policies.actor(), self.settings.episodes, seeds[0],
@@ -148,7 +149,7 @@ class AIRL:
 
     def _samples(self, data: Rollouts, actor, n_samples: int, seed) -> tuple[torch.Tensor, ...]:
         """``n_samples`` transitions per strategy: x, x', and the log-density they were drawn with."""
-        m, e, t = data.rewards.shape
+        e, t = data.rewards.shape[1:]
         flat = np.sort(np.random.default_rng(seed).permutation(e * t)[:n_samples])
         episode, step = np.divmod(flat, t)
         states, successors = data.observations[:, episode, step], data.observations[:, episode, step + 1]

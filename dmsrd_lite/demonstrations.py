@@ -4,6 +4,7 @@ import json
 import os
 import tempfile
 import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -89,18 +90,19 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
         return {}, [f"{path}: there is no such file; expected a demonstration set (.npz)"]
     arrays, faults = {}, []
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if not hasattr(file, "files"):
-                return {}, [f"{path}: holds a single array; expected an .npz with named arrays"]
+        file = np.load(path, allow_pickle=False)
+        if isinstance(file, np.ndarray):
+            return {}, [f"{path}: holds a single array; expected an .npz with named arrays"]
+        with file:
             for name in file.files:
                 try:
                     arrays[name] = file[name]
                 except ValueError as error:
-                    if "allow_pickle" not in str(error) and "Object arrays" not in str(error):
+                    if "Object arrays" not in str(error):
                         raise
                     faults.append(f"{path}: {name}: holds pickled objects (trajectories of unequal length end up so); "
                                   "expected one array of numbers, all trajectories equally long")
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zipfile.zlib.error):
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error):
         return {}, [f"{path}: cannot be read (truncated, pickled or no .npz file); expected a file written by save_demonstrations"]
     return arrays, faults
 
@@ -130,7 +132,8 @@ def _check_array(array, name: str, shape: tuple, path: Path) -> list[str]:
         n >= 1 if isinstance(s, str) else n in s if isinstance(s, set) else n == s
         for n, s in zip(array.shape, shape, strict=True))
     if not fits:
-        return [f"{path}: {name}: has shape {array.shape}; expected {wanted}" + (" and at least one demonstration" if 0 in array.shape else "")]
+        hint = " and at least one demonstration" if 0 in array.shape else ""
+        return [f"{path}: {name}: has shape {array.shape}; expected {wanted}{hint}"]
     if not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         return [f"{path}: {name}: holds NaN or infinity, first at index {where}; expected finite numbers"]

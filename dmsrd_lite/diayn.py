@@ -12,83 +12,71 @@ import torch
 from dmsrd_lite.demonstrations import SCHEMA_VERSION, DemonstrationSet, check_folder, save_demonstrations, write_atomically
 from dmsrd_lite.divergence import trajectory_divergences
 from dmsrd_lite.envs import Domain, InputError
-from dmsrd_lite.networks import BatchedMLP, GaussianPolicies, to_tensor
-from dmsrd_lite.policy_optimization import PolicyOptimizer, PPOSettings
+from dmsrd_lite.networks import BatchedMLP, to_tensor
+from dmsrd_lite.policy_optimization import TrainingSettings, train_policies
 from dmsrd_lite.rollouts import Rollouts, draw_reset_seeds, rollout
+
+TEST_SEED, DEVELOPMENT_SEED = 1000, 2000  # added to a generation's seed: the sets share nothing with the demonstrations
 
 
 @dataclass(frozen=True)
 class DiaynSettings:
-    n_strategies: int = 14  # more than are kept: the most distinct of the successful ones are chosen
-    n_iterations: int = 160
-    episodes: int = 8  # per strategy and iteration at the full horizon; more of them while episodes are short
-    first_horizon: int = 100  # steps; grows to the domain's horizon over the first ``growing`` of the iterations
-    growing: float = 0.6
     diversity_weight: float = 0.03  # lambda
-    blur: tuple[float, ...] = ()  # noise on what q(z|s) sees, per coordinate of the network input; () is none
     discriminator_steps: int = 20
-    discriminator_batch: int = 200
+    discriminator_batch: int = 200  # states of each strategy per step
     discriminator_rate: float = 1e-3
-    ppo: PPOSettings = PPOSettings()
+    training: TrainingSettings = TrainingSettings(n_strategies=14, n_iterations=160)  # the ten most distinct are kept
 
 
 class StrategyDiscriminator:
-    """``q(z|s)``: which of M strategies visited the state s."""
+    """``q(z|s)``: which of M strategies was here, seen through ``domain.diversity_features`` with unit noise.
 
-    def __init__(self, domain: Domain, n_strategies: int, settings: DiaynSettings, seed):
+    The noise keeps strategies from settling for differences that nobody would see.
+    """
+
+    def __init__(self, n_features: int, n_strategies: int, settings: DiaynSettings, seed):
         self.settings = settings
-        self.network = BatchedMLP(1, (domain.obs_dim, 64, 64, n_strategies), seed)
+        self.network = BatchedMLP(1, (n_features, 64, 64, n_strategies), seed)
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=settings.discriminator_rate, fused=True)
 
-    def update(self, x: torch.Tensor, seed) -> float:
-        """Cross-entropy steps on states x (M, n, obs_dim); returns the accuracy on the last batch."""
+    def update(self, features: np.ndarray, seed) -> tuple[np.ndarray, float]:
+        """Cross-entropy steps on features (M, n, n_features); returns ``log q(z = j | s)`` (M, n) and the accuracy."""
         rng, s = np.random.default_rng(seed), self.settings
-        labels = torch.arange(x.shape[0]).repeat_interleave(s.discriminator_batch)
+        m, n, d = features.shape
+        x = to_tensor(features + rng.standard_normal(features.shape, dtype=np.float32))
+        labels = torch.arange(m).repeat_interleave(s.discriminator_batch)
         for _ in range(s.discriminator_steps):
-            pick = torch.from_numpy(rng.integers(0, x.shape[1], s.discriminator_batch))
-            logits = self.network(self._blurred(x[:, pick], rng).reshape(1, -1, x.shape[2]))[0]
+            pick = torch.from_numpy(rng.integers(0, n, s.discriminator_batch))
+            logits = self.network(x[:, pick].reshape(1, -1, d))[0]
             self.optimizer.zero_grad()
             torch.nn.functional.cross_entropy(logits, labels).backward()
             self.optimizer.step()
-        return float((logits.argmax(1) == labels).float().mean())
+        with torch.no_grad():
+            log_q = torch.log_softmax(self.network(x.view(1, m * n, d))[0], 1).view(m, n, m)
+        return log_q[torch.arange(m), :, torch.arange(m)].numpy(), float((logits.argmax(1) == labels).float().mean())
 
-    def _blurred(self, x: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-        if not self.settings.blur:
-            return x
-        return x + to_tensor(rng.standard_normal(x.shape, dtype=np.float32) * np.array(self.settings.blur))
 
-    @torch.no_grad()
-    def log_probability(self, x: torch.Tensor, seed) -> np.ndarray:
-        """``log q(z = j | s)`` for the states x[j], (M, n, obs_dim) -> (M, n)."""
-        m, n, d = x.shape
-        x = self._blurred(x, np.random.default_rng(seed))
-        log_q = torch.log_softmax(self.network(x.reshape(1, m * n, d))[0], 1).view(m, n, m)
-        return log_q[torch.arange(m), :, torch.arange(m)].numpy()
+class DiversityReward:
+    """``r + lambda (log q(z|s) - log 1/M)`` for the policy optimiser; updates q at every call and keeps its ``accuracy``."""
+
+    def __init__(self, domain: Domain, settings: DiaynSettings, seed: int):
+        self.weight, m = settings.diversity_weight, settings.training.n_strategies
+        n_features = domain.diversity_features(np.zeros((2, domain.obs_dim))).shape[-1]
+        self.discriminator = StrategyDiscriminator(n_features, m, settings, [seed, 2])
+        self.accuracy = 1 / m
+
+    def __call__(self, data: Rollouts, seed) -> np.ndarray:
+        m, e, t = data.rewards.shape
+        features = data.domain.diversity_features(data.observations).reshape(m, e * t, -1)
+        log_q, self.accuracy = self.discriminator.update(features, seed)
+        return data.rewards + self.weight * (log_q.reshape(m, e, t) + np.log(m))
 
 
 def train_demonstrators(domain: Domain, settings: DiaynSettings, seed: int, n_threads: int = 0) -> Iterator[dict]:
-    """Train M demonstrators together; yields one record per iteration, with the policies as they are then.
-
-    record: ``policies`` (live, copy with ``.actor()``), ``iteration``, ``horizon``, ``task_return`` (M,) per ``horizon``
-    steps, ``accuracy`` of q(z|s), ``steps`` so far in all.
-    """
-    m = settings.n_strategies
-    policies = GaussianPolicies(domain, m, [seed, 0])
-    optimizer = PolicyOptimizer(policies, settings.ppo, [seed, 1])
-    discriminator = StrategyDiscriminator(domain, m, settings, [seed, 2])
-    steps = 0
-    for iteration in range(settings.n_iterations):
-        share = min(1.0, iteration / max(1, settings.growing * settings.n_iterations))
-        horizon = int(settings.first_horizon * (domain.horizon / settings.first_horizon) ** share)
-        episodes = max(settings.episodes, min(4 * settings.episodes, settings.episodes * domain.horizon // (2 * horizon)))
-        data = rollout(domain, policies.actor(), episodes, [seed, 3, iteration], horizon=horizon, n_threads=n_threads)
-        x = to_tensor(domain.network_input(data.observations[:, :, 1:])).view(m, episodes * horizon, -1)
-        accuracy = discriminator.update(x, [seed, 4, iteration])
-        diversity = discriminator.log_probability(x, [seed, 10, iteration]).reshape(m, episodes, horizon) + np.log(m)
-        optimizer.update(data, data.rewards + settings.diversity_weight * diversity, [seed, 5, iteration])
-        steps += data.n_steps
-        yield {"policies": policies, "iteration": iteration, "horizon": horizon, "steps": steps,
-               "task_return": data.returns.mean(1), "accuracy": accuracy}
+    """Train M demonstrators together: the records of ``train_policies``, with the ``accuracy`` of q(z|s)."""
+    reward = DiversityReward(domain, settings, seed)
+    for record in train_policies(domain, reward, settings.training, seed, n_threads):
+        yield {**record, "accuracy": reward.accuracy}
 
 
 def most_distinct(divergences: np.ndarray, n_kept: int) -> list[int]:
@@ -123,20 +111,19 @@ def generate_demonstrations(domain: Domain, seed: int, folder: Path, *, settings
     """
     settings = settings or DiaynSettings()
     takes = {take: check_folder(Path(folder) / f"{domain.name}_{take}.npz") for take in ("demonstrations", "second_take")}
-    for record in progress(train_demonstrators(domain, settings, seed)):
-        pass
-    actor = record["policies"].actor()
+    *_, last = progress(train_demonstrators(domain, settings, seed))
+    actor = last["policies"].actor()
     trial = rollout(domain, actor, 10, [seed, 6])
-    failed = domain.failed(trial.observations).any(1) | (trial.returns < domain.success_return).any(1)
+    failed = domain.failed(trial.observations).any((1, 2)) | (trial.returns < domain.success_return).any(1)
     successful = np.flatnonzero(~failed)
     if len(successful) < n_kept:
-        raise InputError(f"only {len(successful)} of {settings.n_strategies} demonstrators of {domain.name} with seed {seed} "
+        raise InputError(f"only {len(successful)} of {settings.training.n_strategies} demonstrators of {domain.name} with seed {seed} "
                          f"succeeded; expected {n_kept}: train longer or take another seed")
     table = np.array([[trajectory_divergences(domain, trial.observations[i, :3], trial.observations[j, 3:6]).mean()
                        for j in successful] for i in successful])
     kept = successful[most_distinct(table, n_kept)]
     chosen = table[np.ix_(np.isin(successful, kept), np.isin(successful, kept))]
-    choice = {"trained": settings.n_strategies, "successful": successful.tolist(), "kept": kept.tolist(),
+    choice = {"trained": settings.training.n_strategies, "successful": successful.tolist(), "kept": kept.tolist(),
               "smallest_divergence": round(float(chosen[~np.eye(n_kept, dtype=bool)].min()), 3),
               "largest_own_divergence": round(float(np.diag(chosen).max()), 3)}
     metadata = {"seed": seed, "choice": choice, "settings": dataclasses.asdict(settings),
@@ -156,16 +143,16 @@ def generate_test_set(domain: Domain, seed: int, path: Path, *, settings: DiaynS
     Writes ``observations`` (n, T/stride, obs_dim) in half precision, ``returns``, ``policy``, ``snapshot``, ``metadata``.
     """
     path = check_folder(path)
-    settings = settings or DiaynSettings(n_strategies=10, n_iterations=120)
-    moments = set(np.linspace(0, settings.n_iterations - 1, n_snapshots).astype(int).tolist())
+    settings = settings or DiaynSettings(training=TrainingSettings(n_strategies=10, n_iterations=120))
+    moments = set(np.linspace(0, settings.training.n_iterations - 1, n_snapshots).astype(int).tolist())
     states, returns = [], []
     for record in progress(train_demonstrators(domain, settings, seed)):
         if record["iteration"] in moments:
             data = rollout(domain, record["policies"].actor(), n_episodes, [seed, 9, record["iteration"]])
             states.append(data.observations[:, :, stride::stride].reshape(-1, domain.horizon // stride, domain.obs_dim).astype(np.float16))
             returns.append(data.returns.reshape(-1))
-    policy = np.tile(np.repeat(np.arange(settings.n_strategies), n_episodes), len(states))
-    snapshot = np.repeat(np.arange(len(states)), settings.n_strategies * n_episodes)
+    policy = np.tile(np.repeat(np.arange(settings.training.n_strategies), n_episodes), len(states))
+    snapshot = np.repeat(np.arange(len(states)), settings.training.n_strategies * n_episodes)
     metadata = {"domain": domain.name, "schema_version": SCHEMA_VERSION, "stride": stride, "seed": seed,
                 "settings": dataclasses.asdict(settings)}
     return write_atomically(path, lambda f: np.savez_compressed(

@@ -50,3 +50,10 @@ def own_divergence(domain: Domain, demonstration: np.ndarray) -> float:
     """The floor without a second take: a demonstration's own trajectories against each other, nats."""
     table = trajectory_divergences(domain, demonstration, demonstration)
     return float(table[~np.eye(len(table), dtype=bool)].mean())
+
+
+def divergence_table(domain: Domain, demonstrations: np.ndarray) -> np.ndarray:
+    """Every demonstration against every other's trajectories, (n, k, T, d) -> (n, n) nats; the diagonal is ``own_divergence``."""
+    n = len(demonstrations)
+    return np.array([[own_divergence(domain, demonstrations[i]) if i == j else
+                      demonstration_divergence(domain, demonstrations[i], demonstrations[j]) for j in range(n)] for i in range(n)])

@@ -36,10 +36,12 @@ class Domain:
     observation_scale: tuple[float, ...]  # ... and divided by this
     reward_text: str
     failure_text: str  # the word used in tables, e.g. "falls"
-    failed: Callable[[np.ndarray], np.ndarray]  # observations (..., T, obs_dim) -> (...,) bool
+    failed: Callable[[np.ndarray], np.ndarray]  # states (..., obs_dim) -> (...,) bool: has the task failed here?
     make_batch: Callable[[int, int], object]
     draw_frame: Callable[[np.ndarray], np.ndarray]  # one observation -> (height, width, 3) uint8
     phase_axes: tuple[int, int]  # the two observations that show a strategy best
+    reward_axes: tuple[int, int]  # the two observations over which a reward is drawn
+    diversity_features: Callable[[np.ndarray], np.ndarray]  # (..., T+1, obs_dim) -> (..., T, n), unit = a visible difference
     success_return: float  # a demonstrator reaches at least this
     knn_resolution: float  # distances below this are the noise of the recording (divergence)
     kl_margin: float  # demonstrators of different strategies are at least this many nats apart
@@ -51,6 +53,11 @@ class Domain:
     @property
     def action_dim(self) -> int:
         return len(self.action_names)
+
+    def first_failure(self, observations: np.ndarray) -> int:
+        """The step at which a trajectory (T, obs_dim) first fails; T when it never does."""
+        steps = np.flatnonzero(self.failed(observations))
+        return int(steps[0]) if len(steps) else len(observations)
 
     def network_input(self, observations: np.ndarray) -> np.ndarray:
         """What a network sees: ``clip(s, low, high) / scale`` as float32, same shape as ``observations``."""
@@ -113,6 +120,14 @@ def draw_pendulum(observation: np.ndarray, height: int = 120, width: int = 240) 
     return np.asarray(image.resize((width, height), Image.LANCZOS))
 
 
+def pendulum_features(observations: np.ndarray, position: float = 0.15, movement: float = 0.05, lag: int = 25) -> np.ndarray:
+    """What makes two strategies look different: where the cart is and how far it moved within the last second."""
+    x = observations[..., 0]
+    now = np.arange(1, x.shape[-1])
+    moved = x[..., now] - x[..., np.maximum(now - lag, 0)]
+    return np.stack([x[..., 1:] / position, moved / movement], axis=-1)
+
+
 INVERTED_PENDULUM = Domain(
     name="inverted_pendulum",
     title="Inverted Pendulum",
@@ -127,10 +142,12 @@ INVERTED_PENDULUM = Domain(
     observation_scale=(1.0, 1.0, 2.0, 4.0),
     reward_text="-|theta| of the new state, in rad, every step",
     failure_text="falls",
-    failed=lambda observations: (np.abs(observations[..., 1]) > 1.0).any(axis=-1),
+    failed=lambda observations: np.abs(observations[..., 1]) > 1.0,
     make_batch=PendulumBatch,
     draw_frame=draw_pendulum,
     phase_axes=(0, 2),
+    reward_axes=(1, 0),
+    diversity_features=pendulum_features,
     success_return=-60.0,
     knn_resolution=1e-9,
     kl_margin=3.0,

@@ -43,7 +43,7 @@ def score_policies(actor, demonstrations: DemonstrationSet, seed, *, n_rollouts:
     pairs = zip(demonstrations.observations, data.observations[:, :n_compared], strict=True)
     return {
         "environment_return": data.returns.mean(1),
-        "failure_share": domain.failed(data.observations).mean(1),
+        "failure_share": domain.failed(data.observations).any(-1).mean(1),
         "divergence": np.array([demonstration_divergence(domain, d, r) for d, r in pairs]),
         "log_likelihood_per_step": demonstration_log_likelihood(actor, demonstrations) / demonstrations.horizon,
     }

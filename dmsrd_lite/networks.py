@@ -1,6 +1,7 @@
 """Small networks for many strategies at once: every weight has a leading strategy axis."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ class BatchedMLP(torch.nn.Module):
         super().__init__()
         rng = np.random.default_rng(seed)
         self.weights, self.biases = torch.nn.ParameterList(), torch.nn.ParameterList()
-        for layer, (n_in, n_out) in enumerate(zip(sizes, sizes[1:], strict=False)):
+        for layer, (n_in, n_out) in enumerate(pairwise(sizes)):
             gain = last_gain if layer == len(sizes) - 2 else math.sqrt(2)
             q = np.linalg.qr(rng.standard_normal((n_strategies, max(n_in, n_out), min(n_in, n_out))))[0]
             q = q if n_in >= n_out else q.transpose(0, 2, 1)

@@ -5,14 +5,16 @@ TRPO's conjugate gradient and line search would have to run for each strategy ap
 """
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.signal import lfilter
 
+from dmsrd_lite.envs import Domain
 from dmsrd_lite.networks import SIGMA_FLOOR, BatchedMLP, GaussianPolicies, to_tensor
-from dmsrd_lite.rollouts import Rollouts
+from dmsrd_lite.rollouts import Rollouts, rollout
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,41 @@ class PolicyOptimizer:
         self.optimizer.step()
         with torch.no_grad():
             self.policies.log_sigma.clamp_(min=math.log(SIGMA_FLOOR))
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """Training of policies from nothing on a given reward."""
+
+    n_strategies: int = 10
+    n_iterations: int = 120
+    episodes: int = 8  # per policy and iteration at the full horizon; up to four times as many while episodes are short
+    first_horizon: int = 100  # steps; grows to the domain's horizon over the first ``growing`` of the iterations
+    growing: float = 0.6
+    ppo: PPOSettings = PPOSettings()
+
+
+def train_policies(domain: Domain, reward: Callable[[Rollouts, list[int]], np.ndarray], settings: TrainingSettings, seed: int,
+                   n_threads: int = 0) -> Iterator[dict]:
+    """Train M fresh policies on ``reward(rollouts, seed) -> (M, E, T)`` with episodes that grow to the full horizon.
+
+    Yields a record per iteration: ``policies`` (live; copy with ``.actor()``), ``iteration``, ``horizon``, ``steps`` so far
+    in all, and ``environment_return`` (M,) over ``horizon`` steps, which trains nothing unless ``reward`` is it.
+    """
+    s = settings
+    policies = GaussianPolicies(domain, s.n_strategies, [seed, 0])
+    optimizer = PolicyOptimizer(policies, s.ppo, [seed, 1])
+    steps = 0
+    for iteration in range(s.n_iterations):
+        share = min(1.0, iteration / max(1, s.growing * s.n_iterations))
+        first = min(s.first_horizon, domain.horizon)
+        horizon = int(first * (domain.horizon / first) ** share)
+        episodes = max(s.episodes, min(4 * s.episodes, s.episodes * domain.horizon // (2 * horizon)))
+        data = rollout(domain, policies.actor(), episodes, [seed, 3, iteration], horizon=horizon, n_threads=n_threads)
+        optimizer.update(data, reward(data, [seed, 4, iteration]), [seed, 5, iteration])
+        steps += data.n_steps
+        yield {"policies": policies, "iteration": iteration, "horizon": horizon, "steps": steps,
+               "environment_return": data.returns.mean(1)}
 
 
 def clone_behavior(policies: GaussianPolicies, x: torch.Tensor, actions: torch.Tensor, seed, *, n_steps: int = 2000,

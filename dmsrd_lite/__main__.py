@@ -1,0 +1,80 @@
+"""Command line: ``python -m dmsrd_lite {generate,validate,workbook,bench}``."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from dmsrd_lite.envs import InputError, check_seed, get_domain
+
+
+def _generate(arguments) -> int:
+    from functools import partial
+
+    from tqdm import tqdm
+
+    from dmsrd_lite.demonstrations import DATA_FOLDER, check_folder
+    from dmsrd_lite.diayn import DEVELOPMENT_SEED, TEST_SEED, generate_demonstrations, generate_test_set
+
+    domain, seed = get_domain(arguments.domain), check_seed(arguments.seed)
+    folder = Path(arguments.output).resolve() if arguments.output else DATA_FOLDER
+    check_folder(folder / "any")
+    choice = generate_demonstrations(domain, seed, folder, progress=partial(tqdm, desc="demonstrators"))
+    print(json.dumps(choice))
+    if not arguments.demonstrations_only:
+        for kind, offset, episodes in (("test_set", TEST_SEED, 10), ("development_set", DEVELOPMENT_SEED, 1)):
+            path = folder / f"{domain.name}_{kind}.npz"
+            generate_test_set(domain, seed + offset, path, n_episodes=episodes, progress=partial(tqdm, desc=kind))
+            print(path)
+    return 0
+
+
+def _validate(arguments) -> int:
+    from dmsrd_lite.demonstrations import validate_file
+
+    faults = [fault for path in arguments.files for fault in validate_file(path)]
+    print("\n".join(faults) if faults else "no faults", file=sys.stderr if faults else sys.stdout)
+    return 2 if faults else 0
+
+
+def _workbook(arguments) -> int:
+    from dmsrd_lite.runs import check_preset, workbook
+
+    return 0 if workbook(check_preset(arguments.preset)) else 1
+
+
+def _bench(arguments) -> int:
+    from dmsrd_lite.bench import bench
+
+    result = bench(check_seed(arguments.seed), n_iterations=arguments.iterations, quiet=arguments.json)
+    print(json.dumps(result))
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m dmsrd_lite", description="The helper package of the DMSRD workbook.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    generate = commands.add_parser("generate", help="train demonstrators; write demonstrations, second take and test sets")
+    generate.add_argument("domain")
+    generate.add_argument("--seed", default="0")
+    generate.add_argument("--output", help="folder for the files (default: the repository's data)")
+    generate.add_argument("--demonstrations-only", action="store_true", help="leave the test and development sets as they are")
+    validate = commands.add_parser("validate", help="say what is wrong with a demonstration or test file")
+    validate.add_argument("files", nargs="+")
+    workbook = commands.add_parser("workbook", help="execute every notebook headless")
+    workbook.add_argument("--preset", default="quick")
+    bench = commands.add_parser("bench", help="training speed over raw simulator speed, in one run")
+    bench.add_argument("--json", action="store_true", help="print the JSON line only")
+    bench.add_argument("--seed", default="0")
+    bench.add_argument("--iterations", type=int, default=6)
+    actions = {"generate": _generate, "validate": _validate, "workbook": _workbook, "bench": _bench}
+    arguments = parser.parse_args(argv)
+    try:
+        return actions[arguments.command](arguments)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,134 @@
+"""Executing the notebooks headless, handing results over, and records of long runs."""
+
+import json
+import math
+import platform
+import re
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from dmsrd_lite.demonstrations import write_atomically
+from dmsrd_lite.envs import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+NOTEBOOKS = ROOT / "notebooks"
+RECORDS = ROOT / "papermill_runs" / "records"
+PRESETS = ("quick", "full")
+CELL_LIMIT = 3600  # seconds; a cell that takes longer has hung
+_MIME = "application/vnd.dmsrd-lite.result+json"
+
+
+def check_preset(preset: str) -> str:
+    """``preset`` itself, or ``InputError`` for one that is not in ``PRESETS``."""
+    if preset not in PRESETS:
+        raise InputError(f"unknown preset {preset!r}: expected one of {', '.join(PRESETS)}")
+    return preset
+
+
+def _plain(value):
+    """Numbers, strings, lists and dicts only, so that JSON can hold it; NaN becomes None."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def hand_over(**results) -> None:
+    """Show results as a JSON output of the cell, so that the executed notebook itself carries them."""
+    from IPython.display import publish_display_data
+
+    plain = _plain(results)
+    publish_display_data({_MIME: plain, "text/plain": json.dumps(plain, indent=1)})
+
+
+def handed_over(notebook) -> dict:
+    """What an executed notebook (nbformat node) handed over, all cells together."""
+    found = {}
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            found.update(output.get("data", {}).get(_MIME, {}))
+    return found
+
+
+def claim(holds: bool, text: str, strict: bool) -> None:
+    """Print ``holds`` or ``does not hold`` before a claim; with ``strict`` (shipped data, default parameters) raise instead."""
+    print(("holds:         " if holds else "does not hold: ") + text)
+    if strict and not holds:
+        raise AssertionError(f"a claim of this lesson does not hold: {text}")
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides the numbers."""
+    packages = ("torch", "mujoco", "gymnasium", "numpy", "scipy")
+    return {"python": platform.python_version(), **{p: version(p).split("+")[0] for p in packages}}
+
+
+def save_record(name: str, parameters: dict, results: dict, tensors: dict[str, np.ndarray], folder: Path = RECORDS) -> Path:
+    """Write ``name.json`` (parameters, versions, machine, results) and ``name.safetensors`` (final networks), atomically."""
+    from safetensors.numpy import save
+
+    record = {"name": name, "parameters": parameters, "versions": versions(),
+              "machine": {"system": platform.system(), "processor": platform.machine()}, "results": results}
+    text = json.dumps(_plain(record), indent=1)
+    text = re.sub(r"\[\n\s+([^\[\]{}]*?)\n\s+\]", lambda m: "[" + re.sub(r"\s*\n\s*", " ", m[1]) + "]", text)  # a list a line
+    binary = save({k: np.ascontiguousarray(v) for k, v in tensors.items()})
+    write_atomically(Path(folder) / f"{name}.safetensors", lambda f: f.write(binary))
+    return write_atomically(Path(folder) / f"{name}.json", lambda f: f.write((text + "\n").encode()))
+
+
+def load_record(name: str, folder: Path = RECORDS) -> tuple[dict, dict[str, np.ndarray]]:
+    """A record and its networks; ``InputError`` when it is missing or cannot be read."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    path = Path(folder) / f"{name}.json"
+    try:
+        return json.loads(path.read_text()), load_file(path.with_suffix(".safetensors"))
+    except (OSError, ValueError, SafetensorError) as error:
+        raise InputError(f"{path}: cannot be read ({type(error).__name__}); expected a record and its .safetensors file") from None
+
+
+def lessons() -> list[Path]:
+    """The notebooks in the order in which they are read."""
+    return sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))
+
+
+def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT) -> tuple[str, float]:
+    """Run one notebook with papermill; returns ("" or the error in one line, seconds). The executed copy is kept either way."""
+    import papermill
+    from papermill.exceptions import PapermillExecutionError
+
+    output.parent.mkdir(parents=True, exist_ok=True)
+    start, error = time.perf_counter(), ""
+    try:
+        papermill.execute_notebook(str(path), str(output), parameters, progress_bar=False, kernel_name="python3",
+                                   cwd=str(folder), execution_timeout=CELL_LIMIT)
+    except PapermillExecutionError as failure:
+        error = f"cell {failure.exec_count}: {failure.ename}: {failure.evalue}"
+    except Exception as failure:  # a dead kernel or a time-out; whatever it is, the other notebooks go on
+        error = f"{type(failure).__name__}: {str(failure).strip().splitlines()[0]}"
+    return error, time.perf_counter() - start
+
+
+def workbook(preset: str, output: Path | None = None, parameters: dict | None = None) -> bool:
+    """Execute all lessons in order with ``preset``; print a table; True when none failed."""
+    from tqdm import tqdm
+
+    output = output or ROOT / "papermill_runs" / check_preset(preset)
+    rows = []
+    with tqdm(lessons(), unit="notebook") as bar:
+        for path in bar:
+            bar.set_description(path.stem)
+            rows.append((path.stem, *execute(path, output / path.name, {"preset": preset, **(parameters or {})})))
+    width = max(len(name) for name, *_ in rows)
+    print(f"{'notebook':<{width}}  seconds  ok")
+    for name, error, seconds in rows:
+        print(f"{name:<{width}}  {seconds:7.1f}  {'yes' if not error else 'NO: ' + error}")
+    print(f"executed copies: {output}")
+    return not any(error for _, error, _ in rows)
