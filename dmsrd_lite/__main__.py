@@ -1,4 +1,4 @@
-"""Command line: ``python -m dmsrd_lite {generate,validate,workbook,bench}``."""
+"""Command line: ``python -m dmsrd_lite {generate,validate,workbook,bench,gallery}``."""
 
 import argparse
 import json
@@ -51,6 +51,13 @@ def _bench(arguments) -> int:
     return 0
 
 
+def _gallery(arguments) -> int:
+    from dmsrd_lite.runs import export_gallery
+
+    print(*export_gallery(Path(arguments.folder)), sep="\n")
+    return 0
+
+
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m dmsrd_lite", description="The helper package of the DMSRD workbook.")
     commands = parser.add_subparsers(dest="command", required=True)
@@ -67,7 +74,9 @@ def main(argv: list[str] | None = None) -> int:
     bench.add_argument("--json", action="store_true", help="print the JSON line only")
     bench.add_argument("--seed", default="0")
     bench.add_argument("--iterations", type=int, default=6)
-    actions = {"generate": _generate, "validate": _validate, "workbook": _workbook, "bench": _bench}
+    gallery = commands.add_parser("gallery", help="take the README's figures out of a folder of executed notebooks")
+    gallery.add_argument("folder")
+    actions = {"gallery": _gallery, "generate": _generate, "validate": _validate, "workbook": _workbook, "bench": _bench}
     arguments = parser.parse_args(argv)
     try:
         return actions[arguments.command](arguments)

@@ -33,13 +33,13 @@ class AIRLSettings:
     coverage: bool = True  # half of the discriminator's policy samples come from wide exploratory rollouts (the paper: off)
     coverage_episodes: int = 2  # of the untrained policy and of the clone at each noise level
     coverage_noise: tuple[float, ...] = (1.0, 3.0, 10.0)  # sigma of the clone times this
-    discriminator_steps: int = 8
-    discriminator_batch: int = 512  # demonstration samples per strategy and step, and as many others
-    discriminator_rate: float = 1e-3
+    discriminator_steps: int = 12
+    discriminator_batch: int = 256  # demonstration samples per strategy and step, and as many others
+    discriminator_rate: float = 3e-3
     replay_iterations: int = 10  # policy samples of so many iterations are kept
     replay_samples: int = 2000  # per strategy and iteration
     reward_average: float = 0.9  # decay of the running average of the reward's weights; 0 keeps the last iterate
-    ppo: PPOSettings = PPOSettings(learning_rate=3e-4)
+    ppo: PPOSettings = PPOSettings(learning_rate=3e-4, sample_fraction=0.5)
 
 
 class Rewards(torch.nn.Module):
@@ -119,8 +119,9 @@ class AIRL:
             self.iteration = iteration
             clock = [time.perf_counter()]
             seeds = [[self.seed, part, self.iteration] for part in (10, 11, 12, 13)]
-            data = rollout(self.domain, self.policies.actor(), self.settings.episodes, seeds[0],
-                           horizon=self.horizon, n_threads=self.n_threads)
+            data = rollout(
+                self.domain, self.policies.actor(), self.settings.episodes, seeds[0], horizon=self.horizon, n_threads=self.n_threads
+            )
             self.steps += data.n_steps // len(self.x)
             clock.append(time.perf_counter())
             self.replay.append(self._samples(data, self.policies.actor(), self.settings.replay_samples, seeds[1]))
@@ -128,12 +129,18 @@ class AIRL:
             self._average()
             clock.append(time.perf_counter())
             demonstrations = (self.x, self.actions)
-            self.optimizer.update(data, self.policy_rewards(data), seeds[3], demonstrations=demonstrations,
-                                  cloning_weight=self.settings.cloning_weight)
+            self.optimizer.update(
+                data, self.policy_rewards(data), seeds[3], demonstrations=demonstrations, cloning_weight=self.settings.cloning_weight
+            )
             clock.append(time.perf_counter())
-            yield {"iteration": self.iteration, "steps": self.steps, "discriminator_loss": loss, "accuracy": accuracy,
-                   "environment_return": data.returns.mean(1),
-                   "seconds": dict(zip(("rollouts", "discriminator", "policy"), np.diff(clock), strict=True))}
+            yield {
+                "iteration": self.iteration,
+                "steps": self.steps,
+                "discriminator_loss": loss,
+                "accuracy": accuracy,
+                "environment_return": data.returns.mean(1),
+                "seconds": dict(zip(("rollouts", "discriminator", "policy"), np.diff(clock), strict=True)),
+            }
         self.iteration = self.settings.n_iterations
 
     def policy_rewards(self, data: Rollouts) -> np.ndarray:
@@ -160,8 +167,7 @@ class AIRL:
         """Coverage: rollouts of the untrained policy and of the clone at several noise levels, made once."""
         s, everyone = self.settings, range(len(self.x))
         for level, actor in enumerate([self.untrained, *(self.clone.select(everyone, factor) for factor in s.coverage_noise)]):
-            data = rollout(self.domain, actor, s.coverage_episodes, [self.seed, 4, level], horizon=self.horizon,
-                           n_threads=self.n_threads)
+            data = rollout(self.domain, actor, s.coverage_episodes, [self.seed, 4, level], horizon=self.horizon, n_threads=self.n_threads)
             self.steps += data.n_steps // len(self.x)
             self.coverage.append(self._samples(data, actor, s.replay_samples, [self.seed, 5, level]))
 

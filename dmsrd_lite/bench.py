@@ -48,7 +48,11 @@ def bench(seed: int = 0, n_iterations: int = 6, quiet: bool = False) -> dict:
     if not quiet:
         for part, value in {"simulator alone (estimate)": steps / simulator, **seconds}.items():
             print(f"{part:28} {value:7.2f} s  {value / sum(seconds.values()):6.1%}")
-    return {"simulator_steps_per_s": round(simulator), "training_steps_per_s": round(training_speed),
-            "ratio": round(training_speed / simulator, 3), "seconds": {k: round(v, 3) for k, v in seconds.items()},
-            "simulator_by_threads": {str(n): round(float(np.median(m))) for n, m in speeds.items()},
-            "settings": {**dataclasses.asdict(settings), "n_environments": n_environments, "seed": seed}}
+    return {
+        "simulator_steps_per_s": round(simulator),
+        "training_steps_per_s": round(training_speed),
+        "ratio": round(training_speed / simulator, 3),
+        "seconds": {k: round(v, 3) for k, v in seconds.items()},
+        "simulator_by_threads": {str(n): round(float(np.median(m))) for n, m in speeds.items()},
+        "settings": {**dataclasses.asdict(settings), "n_environments": n_environments, "seed": seed},
+    }

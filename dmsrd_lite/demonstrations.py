@@ -61,8 +61,7 @@ class DemonstrationSet:
     def pooled(self) -> "DemonstrationSet":
         """All trajectories as one demonstration, as if one user had given them (AIRL Batch)."""
         whole = {n: getattr(self, n) for n in _ARRAYS if n != "strategy_labels" and getattr(self, n) is not None}
-        return DemonstrationSet(self.domain, **{n: a.reshape(1, -1, *a.shape[2:]) for n, a in whole.items()},
-                                metadata=self.metadata)
+        return DemonstrationSet(self.domain, **{n: a.reshape(1, -1, *a.shape[2:]) for n, a in whole.items()}, metadata=self.metadata)
 
 
 _ARRAYS = ("observations", "actions", "rewards", "strategy_labels", "reset_seeds", "log_likelihoods")
@@ -100,8 +99,10 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
                 except ValueError as error:
                     if "Object arrays" not in str(error):
                         raise
-                    faults.append(f"{path}: {name}: holds pickled objects (trajectories of unequal length end up so); "
-                                  "expected one array of numbers, all trajectories equally long")
+                    faults.append(
+                        f"{path}: {name}: holds pickled objects (trajectories of unequal length end up so); "
+                        "expected one array of numbers, all trajectories equally long"
+                    )
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error):
         return {}, [f"{path}: cannot be read (truncated, pickled or no .npz file); expected a file written by save_demonstrations"]
     return arrays, faults
@@ -129,8 +130,8 @@ def _check_array(array, name: str, shape: tuple, path: Path) -> list[str]:
         return [f"{path}: {name}: has type {array.dtype}; expected numbers"]
     wanted = "(" + ", ".join(" or ".join(map(str, sorted(s))) if isinstance(s, set) else str(s) for s in shape) + ")"
     fits = array.ndim == len(shape) and all(
-        n >= 1 if isinstance(s, str) else n in s if isinstance(s, set) else n == s
-        for n, s in zip(array.shape, shape, strict=True))
+        n >= 1 if isinstance(s, str) else n in s if isinstance(s, set) else n == s for n, s in zip(array.shape, shape, strict=True)
+    )
     if not fits:
         hint = " and at least one demonstration" if 0 in array.shape else ""
         return [f"{path}: {name}: has shape {array.shape}; expected {wanted}{hint}"]
@@ -148,8 +149,13 @@ def _check_demonstrations(arrays: dict, domain: Domain, path: Path) -> list[str]
     if faults:
         return faults
     n, k, t = arrays["actions"].shape[:3]
-    shapes = {"observations": (n, k, {t, t + 1}, domain.obs_dim), "rewards": (n, k, t), "strategy_labels": (n,),
-              "reset_seeds": (n, k), "log_likelihoods": (n, k)}
+    shapes = {
+        "observations": (n, k, {t, t + 1}, domain.obs_dim),
+        "rewards": (n, k, t),
+        "strategy_labels": (n,),
+        "reset_seeds": (n, k),
+        "log_likelihoods": (n, k),
+    }
     for name, shape in shapes.items():
         if name in arrays:
             faults += _check_array(arrays[name], name, shape, path)
@@ -159,8 +165,10 @@ def _check_demonstrations(arrays: dict, domain: Domain, path: Path) -> list[str]
     outside = (arrays["actions"] < low) | (arrays["actions"] > high)
     if outside.any():
         where = tuple(int(i) for i in np.argwhere(outside)[0])
-        faults.append(f"{path}: actions: {arrays['actions'][where]:g} at index {where} is outside the bounds; expected executed "
-                      f"actions in [{domain.action_low[where[-1]]:g}, {domain.action_high[where[-1]]:g}]")
+        faults.append(
+            f"{path}: actions: {arrays['actions'][where]:g} at index {where} is outside the bounds; expected executed "
+            f"actions in [{domain.action_low[where[-1]]:g}, {domain.action_high[where[-1]]:g}]"
+        )
     if "reset_seeds" in arrays and arrays["reset_seeds"].dtype.kind not in "iu":
         faults.append(f"{path}: reset_seeds: has type {arrays['reset_seeds'].dtype}; expected whole numbers")
     return faults
@@ -197,8 +205,11 @@ def load_demonstrations(path, domain: Domain | None = None) -> DemonstrationSet:
     arrays, metadata, path = _load_checked(path, "demonstration set")
     if domain is not None and metadata["domain"] != domain.name:
         raise InputError(f"{path}: metadata: domain is {metadata['domain']}; expected {domain.name}")
-    kept = {name: arrays[name].astype(np.int64 if name in ("strategy_labels", "reset_seeds") else np.float64)
-            for name in _ARRAYS if name in arrays}
+    kept = {
+        name: arrays[name].astype(np.int64 if name in ("strategy_labels", "reset_seeds") else np.float64)
+        for name in _ARRAYS
+        if name in arrays
+    }
     return DemonstrationSet(get_domain(metadata["domain"]), **kept, metadata=metadata)
 
 
@@ -220,8 +231,14 @@ def _check_test_set(arrays: dict, domain: Domain, path: Path) -> list[str]:
 def load_test_set(path) -> RewardTestSet:
     """Read and check a test set for rewards; ``InputError`` when it cannot be used."""
     arrays, metadata, _ = _load_checked(path, "test set")
-    return RewardTestSet(get_domain(metadata["domain"]), arrays["observations"].astype(np.float32),
-                         arrays["returns"].astype(np.float64), arrays["policy"], arrays["snapshot"], metadata)
+    return RewardTestSet(
+        get_domain(metadata["domain"]),
+        arrays["observations"].astype(np.float32),
+        arrays["returns"].astype(np.float64),
+        arrays["policy"],
+        arrays["snapshot"],
+        metadata,
+    )
 
 
 def check_folder(path) -> Path:

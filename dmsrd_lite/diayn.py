@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from dmsrd_lite.demonstrations import SCHEMA_VERSION, DemonstrationSet, check_folder, save_demonstrations, write_atomically
-from dmsrd_lite.divergence import trajectory_divergences
+from dmsrd_lite.divergence import divergence_table, own_divergence
 from dmsrd_lite.envs import Domain, InputError
 from dmsrd_lite.networks import BatchedMLP, to_tensor
 from dmsrd_lite.policy_optimization import TrainingSettings, train_policies
@@ -21,11 +21,11 @@ TEST_SEED, DEVELOPMENT_SEED = 1000, 2000  # added to a generation's seed: the se
 
 @dataclass(frozen=True)
 class DiaynSettings:
-    diversity_weight: float = 0.03  # lambda
+    diversity_weight: float = 0.05  # lambda
     discriminator_steps: int = 20
     discriminator_batch: int = 200  # states of each strategy per step
     discriminator_rate: float = 1e-3
-    training: TrainingSettings = TrainingSettings(n_strategies=14, n_iterations=160)  # the ten most distinct are kept
+    training: TrainingSettings = TrainingSettings(n_strategies=16, n_iterations=160, episodes=5, last_sigma=0.15, last_rate=0.3)
 
 
 class StrategyDiscriminator:
@@ -98,15 +98,32 @@ def _demonstration_set(domain: Domain, actor, data: Rollouts, metadata: dict) ->
     m, k, t = data.rewards.shape
     executed = data.executed_actions
     log_pi = actor.log_density(data.observations[:, :, :-1].reshape(m, k * t, -1), executed.reshape(m, k * t, -1))
-    return DemonstrationSet(domain, data.observations, executed, data.rewards, np.arange(m), data.reset_seeds,
-                            log_pi.reshape(m, k, t).astype(np.float64).sum(-1), metadata)
+    return DemonstrationSet(
+        domain,
+        data.observations,
+        executed,
+        data.rewards,
+        np.arange(m),
+        data.reset_seeds,
+        log_pi.reshape(m, k, t).astype(np.float64).sum(-1),
+        metadata,
+    )
 
 
-def generate_demonstrations(domain: Domain, seed: int, folder: Path, *, settings: DiaynSettings | None = None,
-                            n_kept: int = 10, n_trajectories: int = 3, progress=iter) -> dict:
+def generate_demonstrations(
+    domain: Domain,
+    seed: int,
+    folder: Path,
+    *,
+    settings: DiaynSettings | None = None,
+    n_kept: int = 10,
+    n_trajectories: int = 3,
+    progress=iter,
+) -> dict:
     """Train demonstrators, keep the most distinct of the successful ones, write their demonstrations and a second take.
 
-    Success: ten trial episodes all return at least ``domain.success_return`` and none fails. Returns the choice as
+    Success: ten trial episodes all return at least ``domain.success_return``, none fails, and they resemble each other
+    (KL at most ``domain.kl_threshold``). Returns the choice as
     written into the files' metadata; ``InputError`` when fewer than ``n_kept`` succeed (nothing is written then).
     """
     settings = settings or DiaynSettings()
@@ -114,20 +131,30 @@ def generate_demonstrations(domain: Domain, seed: int, folder: Path, *, settings
     *_, last = progress(train_demonstrators(domain, settings, seed))
     actor = last["policies"].actor()
     trial = rollout(domain, actor, 10, [seed, 6])
+    own = np.array([own_divergence(domain, states[:3]) for states in trial.observations])
     failed = domain.failed(trial.observations).any((1, 2)) | (trial.returns < domain.success_return).any(1)
-    successful = np.flatnonzero(~failed)
+    successful = np.flatnonzero(~failed & (own <= domain.kl_threshold))
     if len(successful) < n_kept:
-        raise InputError(f"only {len(successful)} of {settings.training.n_strategies} demonstrators of {domain.name} with seed {seed} "
-                         f"succeeded; expected {n_kept}: train longer or take another seed")
-    table = np.array([[trajectory_divergences(domain, trial.observations[i, :3], trial.observations[j, 3:6]).mean()
-                       for j in successful] for i in successful])
+        raise InputError(
+            f"only {len(successful)} of {settings.training.n_strategies} demonstrators of {domain.name} with seed {seed} "
+            f"succeeded; expected {n_kept}: train longer or take another seed"
+        )
+    table = divergence_table(domain, trial.observations[successful, :3])
     kept = successful[most_distinct(table, n_kept)]
     chosen = table[np.ix_(np.isin(successful, kept), np.isin(successful, kept))]
-    choice = {"trained": settings.training.n_strategies, "successful": successful.tolist(), "kept": kept.tolist(),
-              "smallest_divergence": round(float(chosen[~np.eye(n_kept, dtype=bool)].min()), 3),
-              "largest_own_divergence": round(float(np.diag(chosen).max()), 3)}
-    metadata = {"seed": seed, "choice": choice, "settings": dataclasses.asdict(settings),
-                "made_by": f"python -m dmsrd_lite generate {domain.name} --seed {seed}"}
+    choice = {
+        "trained": settings.training.n_strategies,
+        "successful": successful.tolist(),
+        "kept": kept.tolist(),
+        "smallest_divergence": round(float(chosen[~np.eye(n_kept, dtype=bool)].min()), 3),
+        "largest_own_divergence": round(float(np.diag(chosen).max()), 3),
+    }
+    metadata = {
+        "seed": seed,
+        "choice": choice,
+        "settings": dataclasses.asdict(settings),
+        "made_by": f"python -m dmsrd_lite generate {domain.name} --seed {seed}",
+    }
     actor = actor.select(kept)
     reset_seeds = draw_reset_seeds(np.random.default_rng([seed, 7]), n_kept, n_trajectories)
     for number, (take, path) in enumerate(takes.items()):
@@ -136,8 +163,17 @@ def generate_demonstrations(domain: Domain, seed: int, folder: Path, *, settings
     return choice
 
 
-def generate_test_set(domain: Domain, seed: int, path: Path, *, settings: DiaynSettings | None = None,
-                      n_snapshots: int = 100, n_episodes: int = 10, stride: int = 10, progress=iter) -> Path:
+def generate_test_set(
+    domain: Domain,
+    seed: int,
+    path: Path,
+    *,
+    settings: DiaynSettings | None = None,
+    n_snapshots: int = 100,
+    n_episodes: int = 10,
+    stride: int = 10,
+    progress=iter,
+) -> Path:
     """Trajectories of ten new policies at ``n_snapshots`` moments of a separate training, from failure to success.
 
     Writes ``observations`` (n, T/stride, obs_dim) in half precision, ``returns``, ``policy``, ``snapshot``, ``metadata``.
@@ -153,8 +189,21 @@ def generate_test_set(domain: Domain, seed: int, path: Path, *, settings: DiaynS
             returns.append(data.returns.reshape(-1))
     policy = np.tile(np.repeat(np.arange(settings.training.n_strategies), n_episodes), len(states))
     snapshot = np.repeat(np.arange(len(states)), settings.training.n_strategies * n_episodes)
-    metadata = {"domain": domain.name, "schema_version": SCHEMA_VERSION, "stride": stride, "seed": seed,
-                "settings": dataclasses.asdict(settings)}
-    return write_atomically(path, lambda f: np.savez_compressed(
-        f, observations=np.concatenate(states), returns=np.concatenate(returns).astype(np.float32),
-        policy=policy.astype(np.uint8), snapshot=snapshot.astype(np.uint8), metadata=np.array(json.dumps(metadata))))
+    metadata = {
+        "domain": domain.name,
+        "schema_version": SCHEMA_VERSION,
+        "stride": stride,
+        "seed": seed,
+        "settings": dataclasses.asdict(settings),
+    }
+    return write_atomically(
+        path,
+        lambda f: np.savez_compressed(
+            f,
+            observations=np.concatenate(states),
+            returns=np.concatenate(returns).astype(np.float32),
+            policy=policy.astype(np.uint8),
+            snapshot=snapshot.astype(np.uint8),
+            metadata=np.array(json.dumps(metadata)),
+        ),
+    )

@@ -44,7 +44,8 @@ class Domain:
     diversity_features: Callable[[np.ndarray], np.ndarray]  # (..., T+1, obs_dim) -> (..., T, n), unit = a visible difference
     success_return: float  # a demonstrator reaches at least this
     knn_resolution: float  # distances below this are the noise of the recording (divergence)
-    kl_margin: float  # demonstrators of different strategies are at least this many nats apart
+    kl_margin: float  # demonstrators of different strategies are at least this many nats apart ...
+    kl_threshold: float  # ... and one demonstrator's own trajectories at most this many
 
     @property
     def obs_dim(self) -> int:
@@ -112,20 +113,21 @@ def draw_pendulum(observation: np.ndarray, height: int = 120, width: int = 240) 
     rail = [width * factor / 2 - 1.05 * metre, width * factor / 2 + 1.05 * metre]
     draw.line([rail[0], base_y, rail[1], base_y], fill="#999999", width=3 * factor)
     draw.line([width * factor / 2, base_y + 8 * factor, width * factor / 2, base_y + 14 * factor], fill="#999999", width=factor)
-    draw.rounded_rectangle([base_x - 0.13 * metre, base_y - 8 * factor, base_x + 0.13 * metre, base_y + 8 * factor],
-                           radius=4 * factor, fill="#0072B2")
+    draw.rounded_rectangle(
+        [base_x - 0.13 * metre, base_y - 8 * factor, base_x + 0.13 * metre, base_y + 8 * factor], radius=4 * factor, fill="#0072B2"
+    )
     tip = (base_x + 0.6 * metre * np.sin(theta), base_y - 0.6 * metre * np.cos(theta))
     draw.line([base_x, base_y, *tip], fill="#D55E00", width=5 * factor)
     draw.ellipse([tip[0] - 4 * factor, tip[1] - 4 * factor, tip[0] + 4 * factor, tip[1] + 4 * factor], fill="#D55E00")
     return np.asarray(image.resize((width, height), Image.LANCZOS))
 
 
-def pendulum_features(observations: np.ndarray, position: float = 0.15, movement: float = 0.05, lag: int = 25) -> np.ndarray:
-    """What makes two strategies look different: where the cart is and how far it moved within the last second."""
+def pendulum_features(observations: np.ndarray, position: float = 0.25, movement: float = 0.03, window: int = 75) -> np.ndarray:
+    """What makes strategies look different: where the cart is, and the width of its movement within the last 3 s (m each)."""
     x = observations[..., 0]
-    now = np.arange(1, x.shape[-1])
-    moved = x[..., now] - x[..., np.maximum(now - lag, 0)]
-    return np.stack([x[..., 1:] / position, moved / movement], axis=-1)
+    padded = np.concatenate([np.repeat(x[..., :1], window - 1, axis=-1), x], axis=-1)
+    width = np.ptp(np.lib.stride_tricks.sliding_window_view(padded, window, axis=-1), axis=-1)
+    return np.stack([x[..., 1:] / position, width[..., 1:] / movement], axis=-1)
 
 
 INVERTED_PENDULUM = Domain(
@@ -151,6 +153,7 @@ INVERTED_PENDULUM = Domain(
     success_return=-60.0,
     knn_resolution=1e-9,
     kl_margin=3.0,
+    kl_threshold=1.0,
 )
 
 DOMAINS = {domain.name: domain for domain in (INVERTED_PENDULUM,)}

@@ -30,8 +30,9 @@ def divergence_floor(demonstrations: DemonstrationSet, second_take: Demonstratio
     return np.array([demonstration_divergence(domain, a, b) for a, b in zip(shown, second_take.observations, strict=True)])
 
 
-def score_policies(actor, demonstrations: DemonstrationSet, seed, *, n_rollouts: int = 20, n_compared: int = 10,
-                   n_threads: int = 0) -> dict[str, np.ndarray]:
+def score_policies(
+    actor, demonstrations: DemonstrationSet, seed, *, n_rollouts: int = 20, n_compared: int = 10, n_threads: int = 0
+) -> dict[str, np.ndarray]:
     """Score policy j against demonstration j by stochastic rollouts; each value is (n,).
 
     environment_return: mean undiscounted return. failure_share: share of rollouts that fail. divergence: KL in nats,

@@ -53,14 +53,12 @@ class GaussianPolicies(torch.nn.Module):
     Means and sigmas are in the action's own units.
     """
 
-    def __init__(self, domain: Domain, n_strategies: int, seed: int | list[int], sigma: float = 0.3,
-                 hidden: tuple[int, ...] = (32, 32)):
+    def __init__(self, domain: Domain, n_strategies: int, seed: int | list[int], sigma: float = 0.2, hidden: tuple[int, ...] = (32, 32)):
         super().__init__()
         self.domain = domain
         self.network = BatchedMLP(n_strategies, (domain.obs_dim, *hidden, domain.action_dim), seed, last_gain=0.01)
         half_range = (np.array(domain.action_high) - np.array(domain.action_low)) / 2
-        self.log_sigma = torch.nn.Parameter(
-            torch.tensor(np.log(sigma * half_range), dtype=torch.float32).repeat(n_strategies, 1, 1))
+        self.log_sigma = torch.nn.Parameter(torch.tensor(np.log(sigma * half_range), dtype=torch.float32).repeat(n_strategies, 1, 1))
 
     @property
     def n_strategies(self) -> int:
@@ -103,8 +101,9 @@ class Actor:
     def select(self, indices, sigma_factor: float = 1.0) -> "Actor":
         """The policies ``indices`` (repeats allowed), with every sigma times ``sigma_factor``."""
         pick = np.asarray(indices)
-        return Actor(self.domain, [w[pick] for w in self.weights], [b[pick] for b in self.biases],
-                     self.sigma[pick] * np.float32(sigma_factor))
+        return Actor(
+            self.domain, [w[pick] for w in self.weights], [b[pick] for b in self.biases], self.sigma[pick] * np.float32(sigma_factor)
+        )
 
 
 def to_tensor(x: np.ndarray) -> torch.Tensor:

@@ -14,9 +14,16 @@ STRATEGY_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#0072B2", "#D55E
 STRATEGY_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 METHOD_LINES = {"demonstrator": "-", "cloning": ":", "AIRL Single": "--", "AIRL Batch": "-."}
 STYLE = {
-    "figure.facecolor": "white", "axes.facecolor": "white", "savefig.facecolor": "white", "figure.dpi": 90,
-    "axes.spines.top": False, "axes.spines.right": False, "font.size": 10, "legend.frameon": False,
-    "axes.titlesize": 10, "figure.constrained_layout.use": True,
+    "figure.facecolor": "white",
+    "axes.facecolor": "white",
+    "savefig.facecolor": "white",
+    "figure.dpi": 90,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "font.size": 10,
+    "legend.frameon": False,
+    "axes.titlesize": 10,
+    "figure.constrained_layout.use": True,
 }
 
 
@@ -83,8 +90,14 @@ def plot_per_demonstration(values: dict[str, np.ndarray], ax=None, ylabel: str =
             ax.hlines(numbers, x - 0.4, x + 0.4, color="black", label=name)
         else:
             shift = (methods.index(name) - (len(methods) - 1) / 2) * 0.2
-            ax.plot(x + shift, numbers, "osD^"[methods.index(name) % 4], label=name, markersize=5,
-                    color=STRATEGY_COLORS[(4, 5, 2, 3)[methods.index(name) % 4]])
+            ax.plot(
+                x + shift,
+                numbers,
+                "osD^"[methods.index(name) % 4],
+                label=name,
+                markersize=5,
+                color=STRATEGY_COLORS[(4, 5, 2, 3)[methods.index(name) % 4]],
+            )
     ax.set(xlabel="demonstration", ylabel=ylabel, xticks=x)
     ax.legend(loc="best", fontsize=8)
     return ax

@@ -27,7 +27,6 @@ class PPOSettings:
     minibatch: int = 1000  # samples per strategy and gradient step
     sample_fraction: float = 1.0  # share of the samples that the gradient steps see in an epoch
     value_weight: float = 0.5
-    entropy_weight: float = 0.0
     gradient_norm: float = 1.0  # per strategy
 
 
@@ -70,12 +69,11 @@ class PolicyOptimizer:
     def _evaluate(self, x: torch.Tensor, shape: tuple[int, ...]) -> np.ndarray:
         return self.values(x).numpy().reshape(shape).astype(np.float64) / (1 - self.settings.discount)
 
-    def update(self, rollouts: Rollouts, rewards: np.ndarray, seed, *, demonstrations=None, cloning_weight: float = 0.0) -> dict:
+    def update(self, rollouts: Rollouts, rewards: np.ndarray, seed, *, demonstrations=None, cloning_weight: float = 0.0) -> None:
         """One PPO update of every policy on ``rewards`` (M, E, T), any per-step reward of these rollouts.
 
-        Loss: ``-E[min(rho A, clip(rho) A)]`` with ``rho`` the ratio at the unclipped samples, plus the value loss, minus
-        entropy, plus ``cloning_weight * E_demo[-log pi]`` when ``demonstrations = (x (M, n, d), actions (M, n, a))``.
-        Returns the mean absolute log-ratio per strategy, ``{"log_ratio": (M,)}``.
+        Loss: ``-E[min(rho A, clip(rho) A)]`` with ``rho`` the ratio at the unclipped samples, plus the value loss, plus
+        ``cloning_weight * E_demo[-log pi]`` when ``demonstrations = (x (M, n, d), actions (M, n, a))``.
         """
         s, rng = self.settings, np.random.default_rng(seed)
         m, e, t = rewards.shape
@@ -87,8 +85,7 @@ class PolicyOptimizer:
         advantages = to_tensor(advantages / (advantages.std((1, 2), keepdims=True) + 1e-8)).view(m, -1)
         x = x_all.view(m, e, t + 1, -1)[:, :, :-1].reshape(m, e * t, -1)
         actions = to_tensor(rollouts.actions).view(m, e * t, -1)
-        with torch.no_grad():
-            old = self.policies.log_density(x, actions)
+        old = to_tensor(rollouts.log_densities).view(m, e * t)
         used = max(1, int(e * t * s.sample_fraction))
         for _ in range(s.epochs):
             order = torch.from_numpy(rng.permutation(e * t)[:used])
@@ -98,13 +95,10 @@ class PolicyOptimizer:
                 ratio, a = (new - old[:, pick]).exp(), advantages[:, pick]
                 loss = -torch.minimum(ratio * a, ratio.clamp(1 - s.clip, 1 + s.clip) * a).mean(1).sum()
                 loss = loss + s.value_weight * (self.values(x[:, pick])[..., 0] - targets[:, pick]).square().mean(1).sum()
-                if s.entropy_weight:
-                    loss = loss - s.entropy_weight * self.policies.log_sigma.sum()
                 if cloning_weight:
                     some = torch.from_numpy(rng.integers(0, demonstrations[0].shape[1], s.minibatch // 2))
                     loss = loss - cloning_weight * self.policies.log_density(*(d[:, some] for d in demonstrations)).mean(1).sum()
                 self._step(loss)
-        return {"log_ratio": (new - old[:, pick]).abs().mean(1).detach().numpy()}
 
     def _step(self, loss: torch.Tensor) -> None:
         self.optimizer.zero_grad()
@@ -124,11 +118,24 @@ class TrainingSettings:
     episodes: int = 8  # per policy and iteration at the full horizon; up to four times as many while episodes are short
     first_horizon: int = 100  # steps; grows to the domain's horizon over the first ``growing`` of the iterations
     growing: float = 0.6
+    last_sigma: float = 0.0  # sigma shrinks to this (action units) between 0.4 and 0.9 of the iterations; 0: left to the optimiser
+    last_rate: float = 1.0  # the learning rate falls linearly to this share of itself
     ppo: PPOSettings = PPOSettings()
 
 
-def train_policies(domain: Domain, reward: Callable[[Rollouts, list[int]], np.ndarray], settings: TrainingSettings, seed: int,
-                   n_threads: int = 0) -> Iterator[dict]:
+def anneal(policies: GaussianPolicies, optimizer: PolicyOptimizer, settings: TrainingSettings, share: float) -> None:
+    """Lower the bound on sigma and the learning rate; with little noise left, what is rewarded is what a policy means to do."""
+    for group in optimizer.optimizer.param_groups:
+        group["lr"] = settings.ppo.learning_rate * (1 - (1 - settings.last_rate) * share)
+    if settings.last_sigma:
+        progress = min(1.0, max(0.0, (share - 0.4) / 0.5))
+        with torch.no_grad():
+            policies.log_sigma.clamp_(max=progress * math.log(settings.last_sigma))
+
+
+def train_policies(
+    domain: Domain, reward: Callable[[Rollouts, list[int]], np.ndarray], settings: TrainingSettings, seed: int, n_threads: int = 0
+) -> Iterator[dict]:
     """Train M fresh policies on ``reward(rollouts, seed) -> (M, E, T)`` with episodes that grow to the full horizon.
 
     Yields a record per iteration: ``policies`` (live; copy with ``.actor()``), ``iteration``, ``horizon``, ``steps`` so far
@@ -145,13 +152,21 @@ def train_policies(domain: Domain, reward: Callable[[Rollouts, list[int]], np.nd
         episodes = max(s.episodes, min(4 * s.episodes, s.episodes * domain.horizon // (2 * horizon)))
         data = rollout(domain, policies.actor(), episodes, [seed, 3, iteration], horizon=horizon, n_threads=n_threads)
         optimizer.update(data, reward(data, [seed, 4, iteration]), [seed, 5, iteration])
+        anneal(policies, optimizer, s, (iteration + 1) / s.n_iterations)
         steps += data.n_steps
-        yield {"policies": policies, "iteration": iteration, "horizon": horizon, "steps": steps,
-               "environment_return": data.returns.mean(1)}
+        yield {"policies": policies, "iteration": iteration, "horizon": horizon, "steps": steps, "environment_return": data.returns.mean(1)}
 
 
-def clone_behavior(policies: GaussianPolicies, x: torch.Tensor, actions: torch.Tensor, seed, *, n_steps: int = 2000,
-                   minibatch: int = 256, learning_rate: float = 3e-3) -> np.ndarray:
+def clone_behavior(
+    policies: GaussianPolicies,
+    x: torch.Tensor,
+    actions: torch.Tensor,
+    seed,
+    *,
+    n_steps: int = 2000,
+    minibatch: int = 256,
+    learning_rate: float = 3e-3,
+) -> np.ndarray:
     """Behavioural cloning in place: minimise ``E_demo[-log pi_j(a|s)]`` for every strategy at once.
 
     x (M, n, obs_dim) network inputs, actions (M, n, action_dim) executed. Returns the loss every 50 steps, (k, M) nats.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dmsrd_lite.envs import Domain
+from dmsrd_lite.networks import gaussian_log_density
 
 
 @dataclass
@@ -12,12 +13,13 @@ class Rollouts:
     """Episodes of M policies, E each, T steps.
 
     observations (M, E, T+1, obs_dim) raw; actions (M, E, T, action_dim) as sampled (``domain.clip_action`` gives the
-    executed ones); rewards (M, E, T); reset_seeds (M, E).
+    executed ones); log_densities (M, E, T) of the sampled actions; rewards (M, E, T); reset_seeds (M, E).
     """
 
     domain: Domain
     observations: np.ndarray
     actions: np.ndarray
+    log_densities: np.ndarray
     rewards: np.ndarray
     reset_seeds: np.ndarray
 
@@ -39,8 +41,7 @@ def draw_reset_seeds(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return rng.integers(0, 2**31 - 1, shape)
 
 
-def rollout(domain: Domain, actor, n_episodes: int, seed, *, reset_seeds=None, horizon: int = 0,
-            n_threads: int = 0) -> Rollouts:
+def rollout(domain: Domain, actor, n_episodes: int, seed, *, reset_seeds=None, horizon: int = 0, n_threads: int = 0) -> Rollouts:
     """Simulate ``n_episodes`` of every policy of ``actor`` (anything with ``mean``, ``sigma``, ``n_strategies``).
 
     ``a_t = mu_j(s_t) + sigma_j eps_t``; executed is ``clip(a_t)``. ``seed`` (int or list of ints) fixes starts and
@@ -51,7 +52,9 @@ def rollout(domain: Domain, actor, n_episodes: int, seed, *, reset_seeds=None, h
     m, e, t_end = actor.n_strategies, n_episodes, horizon or domain.horizon
     drawn = draw_reset_seeds(rng, m, e)
     reset_seeds = drawn if reset_seeds is None else np.asarray(reset_seeds)
-    noise = rng.standard_normal((t_end, m, e, domain.action_dim), dtype=np.float32) * actor.sigma
+    noise = rng.standard_normal((t_end, m, e, domain.action_dim), dtype=np.float32)
+    log_densities = gaussian_log_density(noise, np.float32(0), np.float32(1)) - np.log(actor.sigma).sum(-1)
+    noise *= actor.sigma
     observations = np.empty((t_end + 1, m, e, domain.obs_dim))
     actions = np.empty((t_end, m, e, domain.action_dim), dtype=np.float32)
     rewards = np.empty((t_end, m, e))
@@ -62,4 +65,5 @@ def rollout(domain: Domain, actor, n_episodes: int, seed, *, reset_seeds=None, h
         executed = domain.clip_action(actions[t]).reshape(m * e, -1)
         state, reward = batch.step(executed)
         observations[t + 1], rewards[t] = state.reshape(m, e, -1), reward.reshape(m, e)
-    return Rollouts(domain, *(np.moveaxis(a, 0, 2) for a in (observations, actions, rewards)), reset_seeds)
+    parts = (np.moveaxis(array, 0, 2) for array in (observations, actions, log_densities, rewards))
+    return Rollouts(domain, *parts, reset_seeds)

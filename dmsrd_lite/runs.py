@@ -1,5 +1,6 @@
 """Executing the notebooks headless, handing results over, and records of long runs."""
 
+import base64
 import json
 import math
 import platform
@@ -73,8 +74,13 @@ def save_record(name: str, parameters: dict, results: dict, tensors: dict[str, n
     """Write ``name.json`` (parameters, versions, machine, results) and ``name.safetensors`` (final networks), atomically."""
     from safetensors.numpy import save
 
-    record = {"name": name, "parameters": parameters, "versions": versions(),
-              "machine": {"system": platform.system(), "processor": platform.machine()}, "results": results}
+    record = {
+        "name": name,
+        "parameters": parameters,
+        "versions": versions(),
+        "machine": {"system": platform.system(), "processor": platform.machine()},
+        "results": results,
+    }
     text = json.dumps(_plain(record), indent=1)
     text = re.sub(r"\[\n\s+([^\[\]{}]*?)\n\s+\]", lambda m: "[" + re.sub(r"\s*\n\s*", " ", m[1]) + "]", text)  # a list a line
     binary = save({k: np.ascontiguousarray(v) for k, v in tensors.items()})
@@ -107,8 +113,9 @@ def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT) -> 
     output.parent.mkdir(parents=True, exist_ok=True)
     start, error = time.perf_counter(), ""
     try:
-        papermill.execute_notebook(str(path), str(output), parameters, progress_bar=False, kernel_name="python3",
-                                   cwd=str(folder), execution_timeout=CELL_LIMIT)
+        papermill.execute_notebook(
+            str(path), str(output), parameters, progress_bar=False, kernel_name="python3", cwd=str(folder), execution_timeout=CELL_LIMIT
+        )
     except PapermillExecutionError as failure:
         error = f"cell {failure.exec_count}: {failure.ename}: {failure.evalue}"
     except Exception as failure:  # a dead kernel or a time-out; whatever it is, the other notebooks go on
@@ -132,3 +139,20 @@ def workbook(preset: str, output: Path | None = None, parameters: dict | None = 
         print(f"{name:<{width}}  {seconds:7.1f}  {'yes' if not error else 'NO: ' + error}")
     print(f"executed copies: {output}")
     return not any(error for _, error, _ in rows)
+
+
+def export_gallery(executed: Path, output: Path = ROOT / "papermill_runs" / "gallery") -> list[Path]:
+    """Write the figure of every cell tagged ``gallery-NAME`` in a folder of executed notebooks to ``NAME.png``."""
+    import nbformat
+
+    written = []
+    for path in sorted(Path(executed).glob("*.ipynb")):
+        for cell in nbformat.read(path, 4).cells:
+            names = [tag.removeprefix("gallery-") for tag in cell.metadata.get("tags", []) if tag.startswith("gallery-")]
+            images = [o["data"]["image/png"] for o in cell.get("outputs", []) if "image/png" in o.get("data", {})]
+            for name, image in zip(names, images, strict=False):
+                content = base64.b64decode(image)
+                written.append(write_atomically(output / f"{name}.png", lambda file, content=content: file.write(content)))
+    if not written:
+        raise InputError(f"{Path(executed).resolve()}: holds no executed notebook with a figure for the gallery")
+    return written

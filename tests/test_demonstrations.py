@@ -74,16 +74,19 @@ FAULTS = {
     "unequal lengths": (change("observations", lambda a: a[:, :, :-3]), "observations: has shape .*; expected .*50 or 51"),
     "nan": (change("observations", put((0, 1, 7, 2), np.nan)), r"observations: holds NaN or infinity, first at index \(0, 1, 7, 2\)"),
     "infinite reward": (change("rewards", put((1, 1, 3), np.inf)), "rewards: holds NaN or infinity"),
-    "action outside the bounds": (change("actions", put((0, 0, 2, 0), 3.5)), r"actions: 3.5 at index .* expected executed actions in \[-3, 3\]"),
+    "action outside the bounds": (
+        change("actions", put((0, 0, 2, 0), 3.5)), r"actions: 3.5 at index .* expected executed actions in \[-3, 3\]"),
     "empty set": (change("actions", lambda a: a[:0]), "actions: has shape .* at least one demonstration"),
     "text instead of numbers": (change("actions", lambda a: a.astype(str)), "actions: has type .*; expected numbers"),
     "labels of another length": (change("strategy_labels", lambda a: np.arange(5)), r"strategy_labels: has shape \(5,\); expected \(2\)"),
     "fractional reset seeds": (change("reset_seeds", lambda a: a + 0.5), "reset_seeds: has type float64; expected whole numbers"),
-    "too short": (lambda a: [a.update({n: a[n][:, :, :5]}) for n in ("observations", "actions", "rewards")], "have 5 steps; expected 10 to 1000"),
+    "too short": (
+        lambda a: [a.update({n: a[n][:, :, :5]}) for n in ("observations", "actions", "rewards")], "have 5 steps; expected 10 to 1000"),
     "no actions": (lambda a: a.pop("actions"), "actions: is missing; expected an array"),
     "no metadata": (lambda a: a.pop("metadata"), "metadata: is missing; expected a JSON text"),
     "metadata no JSON": (change("metadata", lambda a: np.array("{")), "metadata: is no JSON object"),
-    "unknown domain": (change("metadata", lambda a: np.array('{"domain": "x", "schema_version": 1}')), "domain 'x' is unknown; expected one of"),
+    "unknown domain": (
+        change("metadata", lambda a: np.array('{"domain": "x", "schema_version": 1}')), "domain 'x' is unknown; expected one of"),
     "other version": (
         change("metadata", lambda a: np.array('{"domain": "inverted_pendulum", "schema_version": 9}')), "schema_version is 9; expected 1"),
     "pickled": (change("actions", lambda a: np.array([[1], [1, 2]], dtype=object)), "actions: holds pickled objects .* equally long"),
@@ -163,7 +166,7 @@ def test_save_is_atomic_and_refuses_faults(small_set, tmp_path):
 
 def test_unwritable_folder(small_set, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written to .* expected a writable folder"):
+    with pytest.raises(InputError, match=r"cannot be written to .* expected a writable folder"):
         save_demonstrations(tmp_path / "file" / "set.npz", small_set)
 
 

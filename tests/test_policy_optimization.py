@@ -3,8 +3,14 @@ import torch
 
 from dmsrd_lite.networks import GaussianPolicies, to_tensor
 from dmsrd_lite.policy_optimization import (
-    PolicyOptimizer, PPOSettings, TrainingSettings, clip_gradients, clone_behavior, generalized_advantages, train_policies,
-)  # fmt: skip
+    PolicyOptimizer,
+    PPOSettings,
+    TrainingSettings,
+    clip_gradients,
+    clone_behavior,
+    generalized_advantages,
+    train_policies,
+)
 from dmsrd_lite.rollouts import rollout
 
 

@@ -1,0 +1,60 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from dmsrd_lite.demonstrations import load_demonstrations, load_test_set
+from dmsrd_lite.diayn import DiaynSettings, StrategyDiscriminator, generate_demonstrations, generate_test_set, most_distinct
+from dmsrd_lite.envs import DOMAINS, InputError
+from dmsrd_lite.policy_optimization import TrainingSettings
+
+TINY = DiaynSettings(discriminator_steps=2, training=TrainingSettings(n_strategies=3, n_iterations=2, episodes=1, first_horizon=20))
+
+
+def test_discriminator_learns_separate_places():
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(3, 500, 2)) * 0.1 + np.array([[-5.0, 0], [0, 5.0], [5.0, 0]])[:, None]
+    q = StrategyDiscriminator(2, 3, DiaynSettings(discriminator_rate=1e-2), 0)
+    for i in range(10):
+        log_q, accuracy = q.update(features, i)
+    assert accuracy > 0.95
+    assert log_q.shape == (3, 500)
+    assert np.exp(log_q).mean() > 0.9
+
+
+def test_discriminator_cannot_tell_what_is_alike():
+    features = np.random.default_rng(0).normal(size=(2, 2000, 2))
+    q = StrategyDiscriminator(2, 2, DiaynSettings(), 0)
+    log_q, _ = q.update(features, 0)
+    assert np.exp(log_q).mean() == pytest.approx(0.5, abs=0.05)
+
+
+def test_most_distinct_drops_the_crowded_one():
+    place = np.array([0.0, 10.0, 10.5, 13.0, 30.0])
+    assert most_distinct(np.abs(place[:, None] - place[None]), 4) == [0, 1, 3, 4]
+    assert most_distinct(np.abs(place[:, None] - place[None]), 3) == [0, 3, 4], "10 is nearer to the rest than 13"
+
+
+def test_generation_writes_valid_files_and_records_the_choice(domain, tmp_path, monkeypatch):
+    easy = dataclasses.replace(domain, success_return=-1e9, failed=lambda s: np.zeros(s.shape[:-1], bool), horizon=60, kl_threshold=1e9)
+    monkeypatch.setitem(DOMAINS, domain.name, easy)
+    choice = generate_demonstrations(easy, 0, tmp_path, settings=TINY, n_kept=2)
+    shown, again = (load_demonstrations(tmp_path / f"inverted_pendulum_{take}.npz") for take in ("demonstrations", "second_take"))
+    assert shown.metadata["choice"] == json.loads(json.dumps(choice))
+    assert len(choice["kept"]) == 2
+    assert shown.actions.shape == (2, 3, 60, 1)
+    assert np.abs(shown.actions).max() <= 3
+    assert np.array_equal(shown.observations[:, :, 0], again.observations[:, :, 0])
+    assert not np.array_equal(shown.actions, again.actions)
+    path = generate_test_set(easy, 1, tmp_path / "test.npz", settings=TINY, n_snapshots=2, n_episodes=2)
+    test = load_test_set(path)
+    assert test.observations.shape == (2 * 3 * 2, 6, 4)
+    assert test.policy.tolist() == [0, 0, 1, 1, 2, 2] * 2
+    assert test.snapshot.tolist() == [0] * 6 + [1] * 6
+
+
+def test_too_few_successes_write_nothing(domain, tmp_path):
+    with pytest.raises(InputError, match=r"only 0 of 3 demonstrators .* succeeded; expected 2"):
+        generate_demonstrations(domain, 0, tmp_path, settings=TINY, n_kept=2)
+    assert list(tmp_path.iterdir()) == []

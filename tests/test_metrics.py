@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+from scipy.stats import norm, pearsonr
+
+from dmsrd_lite.demonstrations import RewardTestSet
+from dmsrd_lite.divergence import demonstration_divergence, own_divergence
+from dmsrd_lite.metrics import correlations_on, demonstration_log_likelihood, divergence_floor, reward_correlation, score_policies
+from dmsrd_lite.networks import SIGMA_FLOOR, Actor, GaussianPolicies
+from dmsrd_lite.rollouts import rollout
+
+
+def test_log_likelihood_by_hand(small_set, domain):
+    actor = GaussianPolicies(domain, 2, 0).actor()
+    states, actions = small_set.observations[:, :, :50], small_set.actions
+    by_hand = [0.0, 0.0]
+    for j in (0, 1):
+        for k in (0, 1):
+            mean = actor.mean(np.repeat(states[j, k][None], 2, 0))[j]
+            by_hand[j] += norm.logpdf(actions[j, k], mean, actor.sigma[j]).sum() / 2
+    assert demonstration_log_likelihood(actor, small_set) == pytest.approx(by_hand, rel=1e-4)
+
+
+def test_the_demonstrator_reaches_its_own_log_likelihood(domain):
+    from dmsrd_lite.diayn import _demonstration_set
+
+    actor = GaussianPolicies(domain, 2, 0).actor()
+    shown = _demonstration_set(domain, actor, rollout(domain, actor, 2, 0, horizon=50), {})
+    assert demonstration_log_likelihood(actor, shown) == pytest.approx(shown.log_likelihoods.mean(1), rel=1e-5)
+
+
+def test_sigma_has_a_floor_in_the_likelihood(small_set, domain):
+    actor = GaussianPolicies(domain, 2, 0).actor()
+    narrow, floor = (Actor(domain, actor.weights, actor.biases, np.full((2, 1, 1), s, np.float32)) for s in (1e-6, SIGMA_FLOOR))
+    assert np.array_equal(demonstration_log_likelihood(narrow, small_set), demonstration_log_likelihood(floor, small_set))
+
+
+def test_floor_from_second_take_or_own_trajectories(small_set, domain):
+    own = divergence_floor(small_set)
+    assert own[1] == own_divergence(domain, small_set.observations[1])
+    again = divergence_floor(small_set, small_set.select([1, 0]))
+    assert again[0] == demonstration_divergence(domain, small_set.observations[0], small_set.observations[1])
+
+
+def test_scores_are_those_of_the_rollouts(small_set, domain):
+    actor = GaussianPolicies(domain, 2, 0).actor()
+    scores = score_policies(actor, small_set, 5, n_rollouts=4, n_compared=3)
+    data = rollout(domain, actor, 4, 5, horizon=50)
+    assert scores["environment_return"] == pytest.approx(data.returns.mean(1))
+    assert scores["divergence"][0] == demonstration_divergence(domain, small_set.observations[0], data.observations[0, :3])
+    fell = (np.abs(data.observations[..., 1]) > 1).any(-1).mean(1)
+    assert np.array_equal(scores["failure_share"], fell)
+
+
+def test_correlation_is_pearsons(domain):
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 50))
+    assert reward_correlation(a, b) == pytest.approx(pearsonr(a, b).statistic)
+    states = rng.normal(size=(50, 7, 4))
+    test = RewardTestSet(domain, states, -np.abs(states[..., 1]).mean(1), np.zeros(50), np.zeros(50), {})
+
+    class Truth:
+        def evaluate(self, observations):
+            return np.stack([-np.abs(observations[..., 1]), np.abs(observations[..., 1])])
+
+    assert correlations_on(test, Truth()) == pytest.approx([1.0, -1.0])
