@@ -46,8 +46,8 @@ def _workbook(arguments) -> int:
 def _bench(arguments) -> int:
     from dmsrd_lite.bench import bench
 
-    result = bench(check_seed(arguments.seed), n_iterations=arguments.iterations, quiet=arguments.json)
-    print(json.dumps(result))
+    result = bench(check_seed(arguments.seed), n_iterations=arguments.iterations)
+    print(json.dumps(result, indent=None if arguments.json else 1))
     return 0
 
 
@@ -71,7 +71,7 @@ def main(argv: list[str] | None = None) -> int:
     workbook = commands.add_parser("workbook", help="execute every notebook headless")
     workbook.add_argument("--preset", default="quick")
     bench = commands.add_parser("bench", help="training speed over raw simulator speed, in one run")
-    bench.add_argument("--json", action="store_true", help="print the JSON line only")
+    bench.add_argument("--json", action="store_true", help="end with the result as one line of JSON")
     bench.add_argument("--seed", default="0")
     bench.add_argument("--iterations", type=int, default=6)
     gallery = commands.add_parser("gallery", help="take the README's figures out of a folder of executed notebooks")

@@ -7,7 +7,7 @@
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -45,12 +45,12 @@ class AIRLSettings:
 class Rewards(torch.nn.Module):
     """``g_j(s)`` and the shaping term ``h_j(s)`` of M strategies, each an MLP (32, 32) of the state."""
 
-    def __init__(self, domain: Domain, n_strategies: int, discount: float, seed):
+    def __init__(self, domain: Domain, n_strategies: int, discount: float, seed: list[int]):
         super().__init__()
         self.domain, self.discount = domain, discount
         sizes = (domain.obs_dim, 32, 32, 1)
-        self.strategy_reward = BatchedMLP(n_strategies, sizes, [*_list(seed), 0])
-        self.shaping = BatchedMLP(n_strategies, sizes, [*_list(seed), 1])
+        self.strategy_reward = BatchedMLP(n_strategies, sizes, [*seed, 0])
+        self.shaping = BatchedMLP(n_strategies, sizes, [*seed, 1])
 
     def g(self, x: torch.Tensor) -> torch.Tensor:
         """``g_j(s)``: network inputs (M, n, obs_dim) -> (M, n)."""
@@ -65,11 +65,8 @@ class Rewards(torch.nn.Module):
         """``g_j`` at raw observations (..., obs_dim), the same for all strategies: (M, ...)."""
         x = to_tensor(self.domain.network_input(observations)).view(1, -1, self.domain.obs_dim)
         m = self.strategy_reward.n_strategies
-        return self.g(x.expand(m, -1, -1)).numpy().reshape(m, *observations.shape[:-1])
-
-
-def _list(seed) -> list[int]:
-    return list(seed) if isinstance(seed, list | tuple) else [seed]
+        parts = [self.g(part.expand(m, -1, -1)) for part in x.split(100_000, dim=1)]  # bounded memory
+        return torch.cat(parts, 1).numpy().reshape(m, *observations.shape[:-1])
 
 
 def discriminator_loss(demonstration_logits: torch.Tensor, sample_logits: torch.Tensor) -> torch.Tensor:
@@ -88,20 +85,21 @@ class AIRL:
     def __init__(self, demonstrations: DemonstrationSet, settings: AIRLSettings, seed: int, n_threads: int = 0):
         if settings.policy_reward not in POLICY_REWARDS:
             raise InputError(f"policy_reward {settings.policy_reward!r}: expected one of {', '.join(POLICY_REWARDS)}")
-        self.domain, self.settings, self.seed, self.n_threads = demonstrations.domain, settings, seed, n_threads
+        self.domain, self.settings, self.n_threads = demonstrations.domain, settings, n_threads
+        self.seed = seed = [seed, 101]  # streams of its own: a generator with the same seed shares nothing
         self.horizon = demonstrations.horizon
         states, actions, successors = demonstrations.transitions()
         self.x, self.x_next = (to_tensor(self.domain.network_input(s)) for s in (states, successors))
         self.actions = to_tensor(actions)
         m = demonstrations.n_demonstrations
-        untrained = GaussianPolicies(self.domain, m, [seed, 0])
-        cloned = GaussianPolicies(self.domain, m, [seed, 0])
-        self.cloning_curve = clone_behavior(cloned, self.x, self.actions, [seed, 1], n_steps=settings.cloning_steps)
+        untrained = GaussianPolicies(self.domain, m, [*seed, 0])
+        cloned = GaussianPolicies(self.domain, m, [*seed, 0])
+        self.cloning_curve = clone_behavior(cloned, self.x, self.actions, [*seed, 1], n_steps=settings.cloning_steps)
         self.clone, self.untrained = cloned.actor(), untrained.actor()
         self.policies = cloned if settings.warm_start else untrained
-        self.rewards = Rewards(self.domain, m, settings.discount, [seed, 2])
-        self.averaged_rewards = Rewards(self.domain, m, settings.discount, [seed, 2])
-        self.optimizer = PolicyOptimizer(self.policies, settings.ppo, [seed, 3])
+        self.rewards = Rewards(self.domain, m, settings.discount, [*seed, 2])
+        self.averaged_rewards = Rewards(self.domain, m, settings.discount, [*seed, 2])
+        self.optimizer = PolicyOptimizer(self.policies, replace(settings.ppo, discount=settings.discount), [*seed, 3])
         self.reward_optimizer = torch.optim.Adam(self.rewards.parameters(), lr=settings.discriminator_rate, fused=True)
         self.replay: deque = deque(maxlen=settings.replay_iterations)
         self.coverage: list = []
@@ -116,9 +114,8 @@ class AIRL:
         if self.settings.coverage and not self.coverage:
             self._explore()
         for iteration in progress(range(self.iteration, self.settings.n_iterations)):
-            self.iteration = iteration
             clock = [time.perf_counter()]
-            seeds = [[self.seed, part, self.iteration] for part in (10, 11, 12, 13)]
+            seeds = [[*self.seed, part, iteration] for part in (10, 11, 12, 13)]
             data = rollout(
                 self.domain, self.policies.actor(), self.settings.episodes, seeds[0], horizon=self.horizon, n_threads=self.n_threads
             )
@@ -126,22 +123,22 @@ class AIRL:
             clock.append(time.perf_counter())
             self.replay.append(self._samples(data, self.policies.actor(), self.settings.replay_samples, seeds[1]))
             loss, accuracy = self._discriminate(seeds[2])
-            self._average()
+            self._average(iteration)
             clock.append(time.perf_counter())
             demonstrations = (self.x, self.actions)
             self.optimizer.update(
                 data, self.policy_rewards(data), seeds[3], demonstrations=demonstrations, cloning_weight=self.settings.cloning_weight
             )
             clock.append(time.perf_counter())
+            self.iteration = iteration + 1  # a reader may stop here and call ``train`` again
             yield {
-                "iteration": self.iteration,
+                "iteration": iteration,
                 "steps": self.steps,
                 "discriminator_loss": loss,
                 "accuracy": accuracy,
                 "environment_return": data.returns.mean(1),
                 "seconds": dict(zip(("rollouts", "discriminator", "policy"), np.diff(clock), strict=True)),
             }
-        self.iteration = self.settings.n_iterations
 
     def policy_rewards(self, data: Rollouts) -> np.ndarray:
         """What the policy is paid at each step of ``data``: ``g(s')`` of the state reached, or ``f - log pi``; (M, E, T)."""
@@ -167,9 +164,9 @@ class AIRL:
         """Coverage: rollouts of the untrained policy and of the clone at several noise levels, made once."""
         s, everyone = self.settings, range(len(self.x))
         for level, actor in enumerate([self.untrained, *(self.clone.select(everyone, factor) for factor in s.coverage_noise)]):
-            data = rollout(self.domain, actor, s.coverage_episodes, [self.seed, 4, level], horizon=self.horizon, n_threads=self.n_threads)
+            data = rollout(self.domain, actor, s.coverage_episodes, [*self.seed, 4, level], horizon=self.horizon, n_threads=self.n_threads)
             self.steps += data.n_steps // len(self.x)
-            self.coverage.append(self._samples(data, actor, s.replay_samples, [self.seed, 5, level]))
+            self.coverage.append(self._samples(data, actor, s.replay_samples, [*self.seed, 5, level]))
 
     @staticmethod
     def _joined(sources) -> list[torch.Tensor]:
@@ -198,7 +195,7 @@ class AIRL:
         return loss.detach().numpy().copy(), accuracy.numpy()
 
     @torch.no_grad()
-    def _average(self) -> None:
-        decay = self.settings.reward_average if self.iteration else 0.0
+    def _average(self, iteration: int) -> None:
+        decay = min(self.settings.reward_average, iteration / (iteration + 3))  # forgets the start faster
         for mean, now in zip(self.averaged_rewards.parameters(), self.rewards.parameters(), strict=True):
             mean.mul_(decay).add_(now, alpha=1 - decay)

@@ -95,7 +95,10 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
         with file:
             for name in file.files:
                 try:
-                    arrays[name] = file[name]
+                    array = file[name]
+                    if not isinstance(array, np.ndarray):
+                        raise ValueError(f"{name} is no array")
+                    arrays[name] = array
                 except ValueError as error:
                     if "Object arrays" not in str(error):
                         raise
@@ -103,7 +106,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
                         f"{path}: {name}: holds pickled objects (trajectories of unequal length end up so); "
                         "expected one array of numbers, all trajectories equally long"
                     )
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error):
+    except (ValueError, OSError, EOFError, MemoryError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error):
         return {}, [f"{path}: cannot be read (truncated, pickled or no .npz file); expected a file written by save_demonstrations"]
     return arrays, faults
 
@@ -117,7 +120,7 @@ def _read_metadata(arrays: dict, path: Path) -> tuple[dict, list[str]]:
     except (ValueError, AssertionError):
         return {}, [f"{path}: metadata: is no JSON object; expected a JSON text with domain and schema_version"]
     faults = []
-    if metadata.get("domain") not in DOMAINS:
+    if metadata.get("domain") not in list(DOMAINS):
         faults.append(f"{path}: metadata: domain {metadata.get('domain')!r} is unknown; expected one of {', '.join(DOMAINS)}")
     if metadata.get("schema_version") != SCHEMA_VERSION:
         faults.append(f"{path}: metadata: schema_version is {metadata.get('schema_version')!r}; expected {SCHEMA_VERSION}")
@@ -129,9 +132,8 @@ def _check_array(array, name: str, shape: tuple, path: Path) -> list[str]:
     if array.dtype.kind not in "fiub":
         return [f"{path}: {name}: has type {array.dtype}; expected numbers"]
     wanted = "(" + ", ".join(" or ".join(map(str, sorted(s))) if isinstance(s, set) else str(s) for s in shape) + ")"
-    fits = array.ndim == len(shape) and all(
-        n >= 1 if isinstance(s, str) else n in s if isinstance(s, set) else n == s for n, s in zip(array.shape, shape, strict=True)
-    )
+    fits = 0 not in array.shape and array.ndim == len(shape)
+    fits = fits and all(isinstance(s, str) or n in (s if isinstance(s, set) else {s}) for n, s in zip(array.shape, shape, strict=True))
     if not fits:
         hint = " and at least one demonstration" if 0 in array.shape else ""
         return [f"{path}: {name}: has shape {array.shape}; expected {wanted}{hint}"]
@@ -169,8 +171,9 @@ def _check_demonstrations(arrays: dict, domain: Domain, path: Path) -> list[str]
             f"{path}: actions: {arrays['actions'][where]:g} at index {where} is outside the bounds; expected executed "
             f"actions in [{domain.action_low[where[-1]]:g}, {domain.action_high[where[-1]]:g}]"
         )
-    if "reset_seeds" in arrays and arrays["reset_seeds"].dtype.kind not in "iu":
-        faults.append(f"{path}: reset_seeds: has type {arrays['reset_seeds'].dtype}; expected whole numbers")
+    for name in {"reset_seeds", "strategy_labels"} & set(arrays):
+        if arrays[name].dtype.kind not in "iu" or arrays[name].min(initial=0) < 0:
+            faults.append(f"{path}: {name}: has type {arrays[name].dtype} or negative values; expected whole numbers of at least 0")
     return faults
 
 
@@ -178,11 +181,11 @@ def validate_file(path) -> list[str]:
     """One sentence for every fault of a demonstration file or test set; an empty list when it can be used."""
     path = Path(path).resolve()
     arrays, faults = _read(path)
-    if not arrays:
+    if faults and not arrays:
         return faults
     metadata, more = _read_metadata(arrays, path)
     faults += more
-    if metadata.get("domain") in DOMAINS and not faults:
+    if not faults:
         check = _check_test_set if "returns" in arrays else _check_demonstrations
         faults += check(arrays, get_domain(metadata["domain"]), path)
     return faults
@@ -223,8 +226,13 @@ def _check_test_set(arrays: dict, domain: Domain, path: Path) -> list[str]:
     missing = [n for n in ("observations", "policy", "snapshot") if n not in arrays]
     if missing:
         return [f"{path}: {name}: is missing; expected an array of a test set" for name in missing]
+    faults = _check_array(arrays["returns"], "returns", ("trajectories",), path)
+    if not isinstance(json.loads(str(arrays["metadata"])).get("stride"), int):
+        faults.append(f"{path}: metadata: stride is missing; expected every how many steps a state was kept")
+    if faults:
+        return faults
     n = len(arrays["returns"])
-    shapes = {"observations": (n, "steps", domain.obs_dim), "returns": (n,), "policy": (n,), "snapshot": (n,)}
+    shapes = {"observations": (n, "steps", domain.obs_dim), "policy": (n,), "snapshot": (n,)}
     return [fault for name, shape in shapes.items() for fault in _check_array(arrays[name], name, shape, path)]
 
 
@@ -262,8 +270,10 @@ def write_atomically(path, write) -> Path:
             write(file)
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         os.unlink(temporary)
+        if isinstance(error, OSError):
+            raise InputError(f"{path}: cannot be written ({error.strerror}); expected room for a file") from None
         raise
     return path
 

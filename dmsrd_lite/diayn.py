@@ -11,12 +11,12 @@ import torch
 
 from dmsrd_lite.demonstrations import SCHEMA_VERSION, DemonstrationSet, check_folder, save_demonstrations, write_atomically
 from dmsrd_lite.divergence import divergence_table, own_divergence
-from dmsrd_lite.envs import Domain, InputError
-from dmsrd_lite.networks import BatchedMLP, to_tensor
+from dmsrd_lite.envs import Domain, InputError, Population
+from dmsrd_lite.networks import Actor, BatchedMLP, to_tensor
 from dmsrd_lite.policy_optimization import TrainingSettings, train_policies
 from dmsrd_lite.rollouts import Rollouts, draw_reset_seeds, rollout
 
-TEST_SEED, DEVELOPMENT_SEED = 1000, 2000  # added to a generation's seed: the sets share nothing with the demonstrations
+TEST_SEED, DEVELOPMENT_SEED, POPULATION_SEED = 1000, 2000, 3000  # added to a generation's seed: the trainings share nothing
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,12 @@ class DiaynSettings:
     discriminator_steps: int = 20
     discriminator_batch: int = 200  # states of each strategy per step
     discriminator_rate: float = 1e-3
-    training: TrainingSettings = TrainingSettings(n_strategies=16, n_iterations=160, episodes=5, last_sigma=0.15, last_rate=0.3)
+    training: TrainingSettings = TrainingSettings(n_strategies=20, n_iterations=160, episodes=4, last_rate=0.1)
+    acting_noise: float = 0.8  # demonstrators act with this share of the sigma they were trained with
 
 
 class StrategyDiscriminator:
-    """``q(z|s)``: which of M strategies was here, seen through ``domain.diversity_features`` with unit noise.
+    """``q(z|s)``: which of M strategies was here, seen through ``domain.diversity_features`` in a population's units, with unit noise.
 
     The noise keeps strategies from settling for differences that nobody would see.
     """
@@ -59,32 +60,32 @@ class StrategyDiscriminator:
 class DiversityReward:
     """``r + lambda (log q(z|s) - log 1/M)`` for the policy optimiser; updates q at every call and keeps its ``accuracy``."""
 
-    def __init__(self, domain: Domain, settings: DiaynSettings, seed: int):
-        self.weight, m = settings.diversity_weight, settings.training.n_strategies
-        n_features = domain.diversity_features(np.zeros((2, domain.obs_dim))).shape[-1]
-        self.discriminator = StrategyDiscriminator(n_features, m, settings, [seed, 2])
+    def __init__(self, population: Population, settings: DiaynSettings, seed: int):
+        self.units, self.weight, m = np.array(population.feature_units), settings.diversity_weight, settings.training.n_strategies
+        self.discriminator = StrategyDiscriminator(len(self.units), m, settings, [seed, 2])
         self.accuracy = 1 / m
 
     def __call__(self, data: Rollouts, seed) -> np.ndarray:
         m, e, t = data.rewards.shape
-        features = data.domain.diversity_features(data.observations).reshape(m, e * t, -1)
+        features = (data.domain.diversity_features(data.observations) / self.units).reshape(m, e * t, -1)
         log_q, self.accuracy = self.discriminator.update(features, seed)
         return data.rewards + self.weight * (log_q.reshape(m, e, t) + np.log(m))
 
 
-def train_demonstrators(domain: Domain, settings: DiaynSettings, seed: int, n_threads: int = 0) -> Iterator[dict]:
+def train_demonstrators(domain: Domain, population: Population, settings: DiaynSettings, seed: int, n_threads: int = 0) -> Iterator[dict]:
     """Train M demonstrators together: the records of ``train_policies``, with the ``accuracy`` of q(z|s)."""
-    reward = DiversityReward(domain, settings, seed)
-    for record in train_policies(domain, reward, settings.training, seed, n_threads):
+    reward = DiversityReward(population, settings, seed)
+    training = dataclasses.replace(settings.training, last_sigma=population.last_sigma)
+    for record in train_policies(domain, reward, training, seed, n_threads):
         yield {**record, "accuracy": reward.accuracy}
 
 
-def most_distinct(divergences: np.ndarray, n_kept: int) -> list[int]:
+def most_distinct(distance: np.ndarray, n_kept: int) -> list[int]:
     """Greedy choice of ``n_kept`` strategies: again and again drop one of the closest pair, the one nearer to the rest.
 
-    divergences (m, m): the diagonal is not read, a pair's distance is the smaller of its two directions.
+    distance (m, m): the diagonal is not read, a pair's distance is the smaller of its two directions.
     """
-    distance = np.minimum(divergences, divergences.T).astype(float)
+    distance = np.minimum(distance, distance.T).astype(float)
     np.fill_diagonal(distance, np.inf)
     left = list(range(len(distance)))
     while len(left) > n_kept:
@@ -92,6 +93,16 @@ def most_distinct(divergences: np.ndarray, n_kept: int) -> list[int]:
         pair = np.unravel_index(sub.argmin(), sub.shape)
         left.pop(min(pair, key=lambda i: tuple(np.sort(sub[i]))))
     return left
+
+
+def visible_distance(domain: Domain, observations: np.ndarray) -> np.ndarray:
+    """How different strategies look: the largest difference of their mean diversity features, in the finest units.
+
+    observations (m, k, T+1, obs_dim) -> (m, m).
+    """
+    units = np.min([population.feature_units for population in domain.demonstrators], axis=0)
+    means = (domain.diversity_features(observations) / units).mean((1, 2))
+    return np.abs(means[:, None] - means[None]).max(-1)
 
 
 def _demonstration_set(domain: Domain, actor, data: Rollouts, metadata: dict) -> DemonstrationSet:
@@ -122,44 +133,53 @@ def generate_demonstrations(
 ) -> dict:
     """Train demonstrators, keep the most distinct of the successful ones, write their demonstrations and a second take.
 
-    Success: ten trial episodes all return at least ``domain.success_return``, none fails, and they resemble each other
-    (KL at most ``domain.kl_threshold``). Returns the choice as
-    written into the files' metadata; ``InputError`` when fewer than ``n_kept`` succeed (nothing is written then).
+    Success: every trajectory of both takes returns at least ``domain.success_return`` and none fails, and a
+    demonstrator's own trajectories are within ``domain.kl_threshold`` of each other. Of the successful ones those are
+    kept that look most different, at least ``domain.kl_margin`` nats apart. Returns the choice as written into the
+    files' metadata; ``InputError`` when too few are left (nothing is written then).
     """
     settings = settings or DiaynSettings()
     takes = {take: check_folder(Path(folder) / f"{domain.name}_{take}.npz") for take in ("demonstrations", "second_take")}
-    *_, last = progress(train_demonstrators(domain, settings, seed))
-    actor = last["policies"].actor()
-    trial = rollout(domain, actor, 10, [seed, 6])
-    own = np.array([own_divergence(domain, states[:3]) for states in trial.observations])
-    failed = domain.failed(trial.observations).any((1, 2)) | (trial.returns < domain.success_return).any(1)
-    successful = np.flatnonzero(~failed & (own <= domain.kl_threshold))
-    if len(successful) < n_kept:
+    actors = []
+    for number, population in enumerate(domain.demonstrators):
+        *_, last = progress(train_demonstrators(domain, population, settings, seed + number * POPULATION_SEED))
+        actors.append(last["policies"].actor())
+    actor = Actor.joined(actors)
+    everyone = np.arange(actor.n_strategies)
+    actor = actor.select(everyone, settings.acting_noise)
+    starts = draw_reset_seeds(np.random.default_rng([seed, 7]), len(everyone), n_trajectories)
+    shown = [rollout(domain, actor, n_trajectories, [seed, 8, number], reset_seeds=starts) for number in range(len(takes))]
+    fits = np.array([own_divergence(domain, states) <= domain.kl_threshold for states in shown[0].observations])
+    for data in shown:
+        fits &= ~domain.failed(data.observations).any((1, 2)) & (data.returns >= domain.success_return).all(1)
+    kept, smallest = np.flatnonzero(fits), 0.0
+    if len(kept) >= n_kept:
+        states = shown[0].observations[kept]
+        table = divergence_table(domain, states)
+        nearness = table / domain.kl_margin - 1  # below 0: too near, and dropped first
+        pick = most_distinct(np.where(np.minimum(nearness, nearness.T) < 0, nearness, visible_distance(domain, states)), n_kept)
+        smallest = table[np.ix_(pick, pick)][~np.eye(n_kept, dtype=bool)].min()
+        kept, own = kept[pick], np.diag(table)[pick].max()
+    if smallest < domain.kl_margin:
         raise InputError(
-            f"only {len(successful)} of {settings.training.n_strategies} demonstrators of {domain.name} with seed {seed} "
-            f"succeeded; expected {n_kept}: train longer or take another seed"
+            f"only {fits.sum()} of {len(everyone)} demonstrators of {domain.name} with seed {seed} succeeded, the nearest two kept "
+            f"{smallest:.1f} nats apart; expected {n_kept} at least {domain.kl_margin} apart: train longer or take another seed"
         )
-    table = divergence_table(domain, trial.observations[successful, :3])
-    kept = successful[most_distinct(table, n_kept)]
-    chosen = table[np.ix_(np.isin(successful, kept), np.isin(successful, kept))]
     choice = {
-        "trained": settings.training.n_strategies,
-        "successful": successful.tolist(),
-        "kept": kept.tolist(),
-        "smallest_divergence": round(float(chosen[~np.eye(n_kept, dtype=bool)].min()), 3),
-        "largest_own_divergence": round(float(np.diag(chosen).max()), 3),
+        "trained": len(everyone),
+        "successful": np.flatnonzero(fits),
+        "kept": kept,
+        "smallest_divergence": smallest,
+        "largest_own": own,
     }
-    metadata = {
-        "seed": seed,
-        "choice": choice,
-        "settings": dataclasses.asdict(settings),
-        "made_by": f"python -m dmsrd_lite generate {domain.name} --seed {seed}",
-    }
-    actor = actor.select(kept)
-    reset_seeds = draw_reset_seeds(np.random.default_rng([seed, 7]), n_kept, n_trajectories)
-    for number, (take, path) in enumerate(takes.items()):
-        data = rollout(domain, actor, n_trajectories, [seed, 8, number], reset_seeds=reset_seeds)
-        save_demonstrations(path, _demonstration_set(domain, actor, data, {**metadata, "take": take}))
+    choice = {name: np.round(value, 3).tolist() for name, value in choice.items()}
+    metadata = {"seed": seed, "choice": choice, "settings": dataclasses.asdict(settings),
+                "made_by": f"python -m dmsrd_lite generate {domain.name} --seed {seed}"}  # fmt: skip
+    for (take, path), data in zip(takes.items(), shown, strict=True):
+        part = Rollouts(
+            domain, *(getattr(data, name)[kept] for name in ("observations", "actions", "log_densities", "rewards", "reset_seeds"))
+        )
+        save_demonstrations(path, _demonstration_set(domain, actor.select(kept), part, {**metadata, "take": take}))
     return choice
 
 
@@ -182,7 +202,7 @@ def generate_test_set(
     settings = settings or DiaynSettings(training=TrainingSettings(n_strategies=10, n_iterations=120))
     moments = set(np.linspace(0, settings.training.n_iterations - 1, n_snapshots).astype(int).tolist())
     states, returns = [], []
-    for record in progress(train_demonstrators(domain, settings, seed)):
+    for record in progress(train_demonstrators(domain, domain.test_population, settings, seed)):
         if record["iteration"] in moments:
             data = rollout(domain, record["policies"].actor(), n_episodes, [seed, 9, record["iteration"]])
             states.append(data.observations[:, :, stride::stride].reshape(-1, domain.horizon // stride, domain.obs_dim).astype(np.float16))

@@ -47,7 +47,9 @@ def demonstration_divergence(domain: Domain, demonstration: np.ndarray, rollouts
 
 
 def own_divergence(domain: Domain, demonstration: np.ndarray) -> float:
-    """The floor without a second take: a demonstration's own trajectories against each other, nats."""
+    """The floor without a second take: a demonstration's own trajectories against each other, nats; NaN for a single one."""
+    if len(demonstration) < 2:
+        return float("nan")
     table = trajectory_divergences(domain, demonstration, demonstration)
     return float(table[~np.eye(len(table), dtype=bool)].mean())
 

@@ -15,6 +15,14 @@ class InputError(ValueError):
 
 
 @dataclass(frozen=True)
+class Population:
+    """How a group of demonstrators is trained to differ (``diayn``)."""
+
+    feature_units: tuple[float, ...]  # the smallest difference that counts, for each of the domain's diversity features
+    last_sigma: float = 0.0  # action noise at the end of training, action units; 0: left to the optimiser
+
+
+@dataclass(frozen=True)
 class Domain:
     """A task with a fixed horizon that never ends early (shared by all modules and notebooks).
 
@@ -41,7 +49,9 @@ class Domain:
     draw_frame: Callable[[np.ndarray], np.ndarray]  # one observation -> (height, width, 3) uint8
     phase_axes: tuple[int, int]  # the two observations that show a strategy best
     reward_axes: tuple[int, int]  # the two observations over which a reward is drawn
-    diversity_features: Callable[[np.ndarray], np.ndarray]  # (..., T+1, obs_dim) -> (..., T, n), unit = a visible difference
+    diversity_features: Callable[[np.ndarray], np.ndarray]  # (..., T+1, obs_dim) -> (..., T, n): what people would see
+    demonstrators: tuple[Population, ...]  # the demonstrators are chosen from all of these ...
+    test_population: Population  # ... and the test sets for rewards are made by this one
     success_return: float  # a demonstrator reaches at least this
     knn_resolution: float  # distances below this are the noise of the recording (divergence)
     kl_margin: float  # demonstrators of different strategies are at least this many nats apart ...
@@ -94,9 +104,13 @@ class PendulumBatch:
         self._position[:], self._velocity[:] = start[:, :2], start[:, 2:]
         return start
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def simulate(self, actions: np.ndarray) -> None:
+        """One control step and nothing else: what the benchmark calls the raw simulator."""
         self._control[:] = actions
         self._batch.step(nstep=2)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self.simulate(actions)
         return np.concatenate([self._position, self._velocity], axis=1), -np.abs(self._position[:, 1])
 
 
@@ -122,12 +136,12 @@ def draw_pendulum(observation: np.ndarray, height: int = 120, width: int = 240) 
     return np.asarray(image.resize((width, height), Image.LANCZOS))
 
 
-def pendulum_features(observations: np.ndarray, position: float = 0.25, movement: float = 0.03, window: int = 75) -> np.ndarray:
+def pendulum_features(observations: np.ndarray, window: int = 75) -> np.ndarray:
     """What makes strategies look different: where the cart is, and the width of its movement within the last 3 s (m each)."""
     x = observations[..., 0]
     padded = np.concatenate([np.repeat(x[..., :1], window - 1, axis=-1), x], axis=-1)
     width = np.ptp(np.lib.stride_tricks.sliding_window_view(padded, window, axis=-1), axis=-1)
-    return np.stack([x[..., 1:] / position, width[..., 1:] / movement], axis=-1)
+    return np.stack([x[..., 1:], width[..., 1:]], axis=-1)
 
 
 INVERTED_PENDULUM = Domain(
@@ -150,6 +164,8 @@ INVERTED_PENDULUM = Domain(
     phase_axes=(0, 2),
     reward_axes=(1, 0),
     diversity_features=pendulum_features,
+    demonstrators=(Population((0.1, 0.05), last_sigma=0.15), Population((0.4, 0.02), last_sigma=0.3)),  # by place; by movement
+    test_population=Population((0.25, 0.03)),
     success_return=-60.0,
     knn_resolution=1e-9,
     kl_margin=3.0,

@@ -84,6 +84,13 @@ class Actor:
     def __init__(self, domain: Domain, weights: list[np.ndarray], biases: list[np.ndarray], sigma: np.ndarray):
         self.domain, self.weights, self.biases, self.sigma = domain, weights, biases, sigma  # sigma (M, 1, action_dim)
 
+    @classmethod
+    def joined(cls, actors: "list[Actor]") -> "Actor":
+        """All policies of several actors as one."""
+        layers = range(len(actors[0].weights))
+        weights, biases = ([np.concatenate([getattr(a, name)[i] for a in actors]) for i in layers] for name in ("weights", "biases"))
+        return cls(actors[0].domain, weights, biases, np.concatenate([a.sigma for a in actors]))
+
     @property
     def n_strategies(self) -> int:
         return self.sigma.shape[0]

@@ -99,7 +99,7 @@ def plot_per_demonstration(values: dict[str, np.ndarray], ax=None, ylabel: str =
                 color=STRATEGY_COLORS[(4, 5, 2, 3)[methods.index(name) % 4]],
             )
     ax.set(xlabel="demonstration", ylabel=ylabel, xticks=x)
-    ax.legend(loc="best", fontsize=8)
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=8)
     return ax
 
 

@@ -7,6 +7,7 @@ import platform
 import re
 import time
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ def claim(holds: bool, text: str, strict: bool) -> None:
 
 def versions() -> dict[str, str]:
     """Versions of what decides the numbers."""
-    packages = ("torch", "mujoco", "gymnasium", "numpy", "scipy")
+    packages = [p for p in ("torch", "mujoco", "gymnasium", "numpy", "scipy") if find_spec(p)]
     return {"python": platform.python_version(), **{p: version(p).split("+")[0] for p in packages}}
 
 
@@ -119,7 +120,7 @@ def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT) -> 
     except PapermillExecutionError as failure:
         error = f"cell {failure.exec_count}: {failure.ename}: {failure.evalue}"
     except Exception as failure:  # a dead kernel or a time-out; whatever it is, the other notebooks go on
-        error = f"{type(failure).__name__}: {str(failure).strip().splitlines()[0]}"
+        error = f"{type(failure).__name__}: {(str(failure).strip() or 'no message').splitlines()[0]}"
     return error, time.perf_counter() - start
 
 

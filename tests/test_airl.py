@@ -8,6 +8,7 @@ from dmsrd_lite.airl import AIRL, AIRLSettings, Rewards, discriminator_loss
 from dmsrd_lite.envs import InputError
 from dmsrd_lite.networks import to_tensor
 from dmsrd_lite.policy_optimization import PPOSettings
+from dmsrd_lite.rollouts import rollout
 
 TINY = AIRLSettings(n_iterations=2, episodes=1, cloning_steps=60, coverage_episodes=1, coverage_noise=(1.0, 3.0), discriminator_steps=2,
                     discriminator_batch=16, replay_samples=30, ppo=PPOSettings(minibatch=25))  # fmt: skip
@@ -23,7 +24,7 @@ def test_discriminator_loss_equals_the_written_formula():
 
 
 def test_f_is_g_plus_shaping_and_telescopes(domain):
-    rewards = Rewards(domain, 2, 0.9, 0)
+    rewards = Rewards(domain, 2, 0.9, [0])
     x = torch.randn(2, 6, 4, generator=torch.Generator().manual_seed(0))
     f = rewards.f(x[:, :-1], x[:, 1:]).detach()
     g, h = rewards.g(x).detach(), rewards.shaping(x)[..., 0].detach()
@@ -32,7 +33,7 @@ def test_f_is_g_plus_shaping_and_telescopes(domain):
 
 
 def test_reward_gradient_by_finite_differences(domain):
-    rewards = Rewards(domain, 1, 0.99, 0).double()
+    rewards = Rewards(domain, 1, 0.99, [0]).double()
     x = torch.randn(1, 8, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
     def loss():
@@ -52,7 +53,7 @@ def test_reward_gradient_by_finite_differences(domain):
 
 
 def test_evaluate_equals_g_at_raw_observations(domain):
-    rewards = Rewards(domain, 2, 0.99, 0)
+    rewards = Rewards(domain, 2, 0.99, [0])
     states = np.random.default_rng(0).normal(size=(3, 5, 4))
     values = rewards.evaluate(states)
     assert values.shape == (2, 3, 5)
@@ -79,6 +80,21 @@ def test_a_tiny_run_counts_steps_and_is_deterministic(change, small_set):
         assert np.array_equal(a, b)
 
 
+def test_stopping_and_going_on_equals_one_run(small_set):
+    straight, broken = AIRL(small_set, TINY, 0), AIRL(small_set, TINY, 0)
+    list(straight.train())
+    next(broken.train())
+    rest = list(broken.train())
+    assert [r["iteration"] for r in rest] == [1]
+    assert broken.steps == straight.steps
+    for a, b in zip(straight.policies.parameters(), broken.policies.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_discount_reaches_the_policy(small_set):
+    assert AIRL(small_set, dataclasses.replace(TINY, discount=0.5), 0).optimizer.settings.discount == 0.5
+
+
 def test_without_warm_start_the_policy_starts_untrained(small_set):
     cold = AIRL(small_set, dataclasses.replace(TINY, warm_start=False), 0)
     warm = AIRL(small_set, TINY, 0)
@@ -93,11 +109,12 @@ def test_samples_keep_the_density_they_were_drawn_with(small_set):
     list(learner.train())
     x, _, log_pi = learner.replay[0]
     assert x.shape == (2, 30, 4)
-    later = learner.policies.actor()
-    states = x.numpy() * np.array(small_set.domain.observation_scale)
-    now, then = (a.mean(states) for a in (later, actor))
-    assert not np.allclose(now, then), "the policy must have moved, or this test says nothing"
-    assert np.all(log_pi.numpy() <= -np.log(actor.sigma[:, :, 0] * np.sqrt(2 * np.pi)) + 1e-5), "no density above the old peak"
+    data = rollout(small_set.domain, actor, 1, [*learner.seed, 10, 0], horizon=50)
+    again = learner._samples(data, actor, 30, [*learner.seed, 11, 0])
+    assert torch.equal(again[0], x)
+    assert torch.equal(again[2], log_pi)
+    now = learner._samples(data, learner.policies.actor(), 30, [*learner.seed, 11, 0])
+    assert not torch.allclose(now[2], log_pi), "the policy must have moved, or this test says nothing"
 
 
 def test_the_discriminator_learns_to_tell_a_moved_demonstration(small_set):

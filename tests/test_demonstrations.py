@@ -12,6 +12,7 @@ import pytest
 
 from dmsrd_lite.__main__ import main
 from dmsrd_lite.demonstrations import load_demonstrations, load_shipped, load_test_set, save_demonstrations, validate_file
+from dmsrd_lite.divergence import divergence_table
 from dmsrd_lite.envs import InputError
 
 
@@ -79,7 +80,7 @@ FAULTS = {
     "empty set": (change("actions", lambda a: a[:0]), "actions: has shape .* at least one demonstration"),
     "text instead of numbers": (change("actions", lambda a: a.astype(str)), "actions: has type .*; expected numbers"),
     "labels of another length": (change("strategy_labels", lambda a: np.arange(5)), r"strategy_labels: has shape \(5,\); expected \(2\)"),
-    "fractional reset seeds": (change("reset_seeds", lambda a: a + 0.5), "reset_seeds: has type float64; expected whole numbers"),
+    "fractional reset seeds": (change("reset_seeds", lambda a: a + 0.5), "reset_seeds: has type float64 .*; expected whole"),
     "too short": (
         lambda a: [a.update({n: a[n][:, :, :5]}) for n in ("observations", "actions", "rewards")], "have 5 steps; expected 10 to 1000"),
     "no actions": (lambda a: a.pop("actions"), "actions: is missing; expected an array"),
@@ -89,6 +90,11 @@ FAULTS = {
         change("metadata", lambda a: np.array('{"domain": "x", "schema_version": 1}')), "domain 'x' is unknown; expected one of"),
     "other version": (
         change("metadata", lambda a: np.array('{"domain": "inverted_pendulum", "schema_version": 9}')), "schema_version is 9; expected 1"),
+    "domain is no text": (
+        change("metadata", lambda a: np.array('{"domain": ["x"], "schema_version": 1}')), r"domain \['x'\] is unknown; expected one of"),
+    "negative reset seeds": (change("reset_seeds", lambda a: a - 2**31), "reset_seeds: has type int64 .*; expected whole"),
+    "fractional labels": (change("strategy_labels", lambda a: a + 0.5), "strategy_labels: has type float64 .*; expected whole"),
+    "nothing at all": (lambda a: a.clear(), "metadata: is missing"),
     "pickled": (change("actions", lambda a: np.array([[1], [1, 2]], dtype=object)), "actions: holds pickled objects .* equally long"),
 }  # fmt: skip
 
@@ -104,9 +110,8 @@ def test_fault_is_one_sentence_and_exit_code_2(fault, small_set, tmp_path, capsy
         load_demonstrations(path)
     assert str(path) in str(caught.value)
     assert main(["validate", str(path)]) == 2
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    assert str(path) in error
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith(f"{path}: ")
 
 
 def truncated(arrays):
@@ -123,18 +128,50 @@ def one_array(arrays):
 
 def zip_of_text(arrays):
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as file:
+    np.savez(buffer, metadata=arrays["metadata"])
+    with zipfile.ZipFile(buffer, "a") as file:
         file.writestr("observations.npy", b"no array")
     return buffer.getvalue()
 
 
 @pytest.mark.parametrize("content", [truncated, one_array, zip_of_text, lambda a: b"", lambda a: b"no zip at all", lambda a: b"\x80\x04N."])
-def test_unreadable_files(content, small_set, tmp_path):
+def test_unreadable_files(content, small_set, tmp_path, capsys):
     path = tmp_path / "bad.npz"
     path.write_bytes(content(arrays_of(small_set)))
-    with pytest.raises(InputError, match="expected"):
+    with pytest.raises(InputError, match=r"bad\.npz: .*expected"):
         load_demonstrations(path)
     assert main(["validate", str(path)]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+TEST_SET_FAULTS = {
+    "no observations": (lambda a: a.pop("observations"), "observations: is missing"),
+    "other shape": (change("observations", lambda a: a[..., :3]), "observations: has shape .*; expected .* 4"),
+    "other length": (change("policy", lambda a: a[:-1]), r"policy: has shape \(5,\); expected \(6\)"),
+    "nan": (change("returns", put(2, np.nan)), r"returns: holds NaN or infinity, first at index \(2,\)"),
+    "one number": (change("returns", lambda a: a[0]), r"returns: has shape \(\)"),
+    "empty": (lambda a: [a.update({n: a[n][:0]}) for n in a if n != "metadata"], "returns: has shape .* at least one"),
+    "no stride": (change("metadata", lambda a: np.array('{"domain": "inverted_pendulum", "schema_version": 1}')), "stride is missing"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", TEST_SET_FAULTS)
+def test_faulty_test_sets(fault, tmp_path):
+    metadata = np.array(json.dumps({"domain": "inverted_pendulum", "schema_version": 1, "stride": 10}))
+    arrays = {
+        "observations": np.zeros((6, 5, 4)),
+        "returns": np.zeros(6),
+        "policy": np.zeros(6),
+        "snapshot": np.zeros(6),
+        "metadata": metadata,
+    }
+    np.savez(tmp_path / "good.npz", **arrays)
+    assert load_test_set(tmp_path / "good.npz").observations.shape == (6, 5, 4)
+    spoil, sentence = TEST_SET_FAULTS[fault]
+    spoil(arrays)
+    np.savez(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(InputError, match=sentence):
+        load_test_set(tmp_path / "bad.npz")
 
 
 def test_missing_file_and_wrong_kind(small_set, tmp_path):
@@ -185,6 +222,7 @@ def test_read_only_folder(small_set, tmp_path):
         (["generate", "inverted_pendulum", "--output", "FILE/x"], "cannot be written to"),
         (["workbook", "--preset", "huge"], "unknown preset 'huge': expected one of quick, full"),
         (["bench", "--seed", "x"], "seed 'x': expected a whole number"),
+        (["bench", "--iterations", "1"], "iterations 1: expected at least 2"),
     ],
 )
 def test_command_line_refuses_in_one_sentence(arguments, sentence, tmp_path):
@@ -202,12 +240,19 @@ def test_shipped_sets(domain):
     assert np.array_equal(shown.reset_seeds, again.reset_seeds)
     assert np.array_equal(shown.observations[:, :, 0], again.observations[:, :, 0])
     assert not np.array_equal(shown.actions, again.actions)
-    assert shown.returns.min() >= domain.success_return
+    for take in (shown, again):
+        assert take.returns.min() >= domain.success_return
+        assert not domain.failed(take.observations).any()
+    table = divergence_table(domain, shown.observations)
+    assert table[~np.eye(10, dtype=bool)].min() >= domain.kl_margin
+    assert np.diag(table).max() <= domain.kl_threshold
+    assert shown.metadata["choice"]["smallest_divergence"] == pytest.approx(table[~np.eye(10, dtype=bool)].min(), abs=1e-3)
     test, development = load_shipped(domain, "test_set"), load_shipped(domain, "development_set")
     assert test.observations.shape == (10000, 100, 4)
     assert development.observations.shape == (1000, 100, 4)
     assert test.metadata["seed"] != development.metadata["seed"] != shown.metadata["seed"]
     assert len(np.unique(test.snapshot)) == 100
+    assert not np.isin(development.returns, test.returns).any()
     assert test.returns.min() < -1400
     assert test.returns.max() > -20
     sampled = -np.abs(test.observations[:, :, 1]).mean(1) * domain.horizon

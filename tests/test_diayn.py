@@ -5,11 +5,18 @@ import numpy as np
 import pytest
 
 from dmsrd_lite.demonstrations import load_demonstrations, load_test_set
-from dmsrd_lite.diayn import DiaynSettings, StrategyDiscriminator, generate_demonstrations, generate_test_set, most_distinct
+from dmsrd_lite.diayn import (
+    DiaynSettings,
+    StrategyDiscriminator,
+    generate_demonstrations,
+    generate_test_set,
+    most_distinct,
+    visible_distance,
+)
 from dmsrd_lite.envs import DOMAINS, InputError
 from dmsrd_lite.policy_optimization import TrainingSettings
 
-TINY = DiaynSettings(discriminator_steps=2, training=TrainingSettings(n_strategies=3, n_iterations=2, episodes=1, first_horizon=20))
+TINY = DiaynSettings(discriminator_steps=2, training=TrainingSettings(n_strategies=2, n_iterations=2, episodes=1, first_horizon=20))
 
 
 def test_discriminator_learns_separate_places():
@@ -36,8 +43,20 @@ def test_most_distinct_drops_the_crowded_one():
     assert most_distinct(np.abs(place[:, None] - place[None]), 3) == [0, 3, 4], "10 is nearer to the rest than 13"
 
 
+def test_what_looks_different_is_place_and_movement(domain):
+    states = np.zeros((3, 1, 101, 4))
+    states[1, ..., 0] = 0.2  # holds elsewhere
+    states[2, ..., 0] = 0.1 * np.sin(np.arange(101))  # moves to and fro
+    distance = visible_distance(domain, states)
+    assert distance[0, 1] == pytest.approx(0.2 / 0.1)
+    assert distance[0, 2] > 5, "a movement 0.2 m wide, in units of 0.02 m"
+    assert np.allclose(distance, distance.T)
+
+
 def test_generation_writes_valid_files_and_records_the_choice(domain, tmp_path, monkeypatch):
-    easy = dataclasses.replace(domain, success_return=-1e9, failed=lambda s: np.zeros(s.shape[:-1], bool), horizon=60, kl_threshold=1e9)
+    easy = dataclasses.replace(
+        domain, success_return=-1e9, failed=lambda s: np.zeros(s.shape[:-1], bool), horizon=60, kl_threshold=1e9, kl_margin=-1e9
+    )
     monkeypatch.setitem(DOMAINS, domain.name, easy)
     choice = generate_demonstrations(easy, 0, tmp_path, settings=TINY, n_kept=2)
     shown, again = (load_demonstrations(tmp_path / f"inverted_pendulum_{take}.npz") for take in ("demonstrations", "second_take"))
@@ -49,12 +68,12 @@ def test_generation_writes_valid_files_and_records_the_choice(domain, tmp_path, 
     assert not np.array_equal(shown.actions, again.actions)
     path = generate_test_set(easy, 1, tmp_path / "test.npz", settings=TINY, n_snapshots=2, n_episodes=2)
     test = load_test_set(path)
-    assert test.observations.shape == (2 * 3 * 2, 6, 4)
-    assert test.policy.tolist() == [0, 0, 1, 1, 2, 2] * 2
-    assert test.snapshot.tolist() == [0] * 6 + [1] * 6
+    assert test.observations.shape == (2 * 2 * 2, 6, 4)
+    assert test.policy.tolist() == [0, 0, 1, 1] * 2
+    assert test.snapshot.tolist() == [0] * 4 + [1] * 4
 
 
 def test_too_few_successes_write_nothing(domain, tmp_path):
-    with pytest.raises(InputError, match=r"only 0 of 3 demonstrators .* succeeded; expected 2"):
-        generate_demonstrations(domain, 0, tmp_path, settings=TINY, n_kept=2)
-    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match=r"only 0 of 4 demonstrators .* succeeded, .*; expected 2"):
+        generate_demonstrations(domain, 0, tmp_path / "new", settings=TINY, n_kept=2)
+    assert list(tmp_path.glob("**/*.npz")) == []

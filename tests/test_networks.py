@@ -2,7 +2,7 @@ import numpy as np
 import torch
 from scipy.stats import norm
 
-from dmsrd_lite.networks import BatchedMLP, GaussianPolicies, to_tensor
+from dmsrd_lite.networks import Actor, BatchedMLP, GaussianPolicies, to_tensor
 
 
 def test_batched_network_equals_each_network_alone():
@@ -33,6 +33,14 @@ def test_actor_select_repeats_and_widens(domain):
     x = np.random.default_rng(0).normal(size=(1, 5, 4))
     assert np.allclose(wide.mean(np.repeat(x, 2, 0))[0], actor.mean(np.repeat(x, 3, 0))[2])
     assert np.allclose(wide.sigma, 3 * actor.sigma[[2, 2]])
+
+
+def test_joined_actors_act_as_each(domain):
+    actors = [GaussianPolicies(domain, n, n).actor() for n in (1, 2)]
+    x = np.random.default_rng(0).normal(size=(3, 5, 4))
+    both = Actor.joined(actors)
+    assert np.array_equal(both.mean(x), np.concatenate([actors[0].mean(x[:1]), actors[1].mean(x[1:])]))
+    assert both.n_strategies == 3
 
 
 def test_network_input_is_clipped_and_scaled(domain):
