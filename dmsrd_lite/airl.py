@@ -28,7 +28,7 @@ class AIRLSettings:
     discount: float = 0.99  # gamma, in f and for the policy
     policy_reward: str = "g"  # "g" as in the paper, or "f_minus_log_pi" = log D - log(1 - D)
     warm_start: bool = True  # start from behavioural cloning (the paper: off)
-    cloning_weight: float = 0.3  # weight of the demonstration's negative log-likelihood in the policy loss (the paper: 0)
+    cloning_weight: float = 1.0  # weight of the demonstration's negative log-likelihood in the policy loss (the paper: 0)
     cloning_steps: int = 2000
     coverage: bool = True  # half of the discriminator's policy samples come from wide exploratory rollouts (the paper: off)
     coverage_episodes: int = 2  # of the untrained policy and of the clone at each noise level
@@ -39,11 +39,17 @@ class AIRLSettings:
     replay_iterations: int = 10  # policy samples of so many iterations are kept
     replay_samples: int = 2000  # per strategy and iteration
     reward_average: float = 0.9  # decay of the running average of the reward's weights; 0 keeps the last iterate
-    ppo: PPOSettings = PPOSettings(learning_rate=3e-4, sample_fraction=0.5)
+    ppo: PPOSettings = PPOSettings(learning_rate=1e-4, sample_fraction=0.5)
 
 
 class Rewards(torch.nn.Module):
-    """``g_j(s)`` and the shaping term ``h_j(s)`` of M strategies, each an MLP (32, 32) of the state."""
+    """``g_j(s)`` and the shaping term ``h_j(s)`` of M strategies, each an MLP (32, 32) of the state.
+
+    ``g`` is bounded: a discriminator that is sure of two kinds of failure would otherwise go on to call one far worse than
+    the other, and a policy that falls anyway would learn to fall the better way instead of not falling.
+    """
+
+    bound = 5.0  # nats
 
     def __init__(self, domain: Domain, n_strategies: int, discount: float, seed: list[int]):
         super().__init__()
@@ -53,8 +59,8 @@ class Rewards(torch.nn.Module):
         self.shaping = BatchedMLP(n_strategies, sizes, [*seed, 1])
 
     def g(self, x: torch.Tensor) -> torch.Tensor:
-        """``g_j(s)``: network inputs (M, n, obs_dim) -> (M, n)."""
-        return self.strategy_reward(x)[..., 0]
+        """``g_j(s) = b tanh(net_j(s) / b)``: network inputs (M, n, obs_dim) -> (M, n), within the bound b."""
+        return self.bound * torch.tanh(self.strategy_reward(x)[..., 0] / self.bound)
 
     def f(self, x: torch.Tensor, x_next: torch.Tensor) -> torch.Tensor:
         """``g(s) + gamma h(s') - h(s)``, (M, n)."""

@@ -116,7 +116,8 @@ class TrainingSettings:
     n_strategies: int = 10
     n_iterations: int = 120
     episodes: int = 8  # per policy and iteration at the full horizon; up to four times as many while episodes are short
-    first_horizon: int = 100  # steps; grows to the domain's horizon over the first ``growing`` of the iterations
+    first_horizon: int = 100  # steps; grows to the domain's horizon between the shares ``hold`` and ``growing`` of the iterations
+    hold: float = 0.0
     growing: float = 0.6
     last_sigma: float = 0.0  # sigma shrinks to this (action units) between 0.4 and 0.9 of the iterations; 0: left to the optimiser
     last_rate: float = 1.0  # the learning rate falls linearly to this share of itself
@@ -146,7 +147,7 @@ def train_policies(
     optimizer = PolicyOptimizer(policies, s.ppo, [seed, 1])
     steps = 0
     for iteration in range(s.n_iterations):
-        share = min(1.0, iteration / max(1, s.growing * s.n_iterations))
+        share = min(1.0, max(0.0, iteration - s.hold * s.n_iterations) / max(1, (s.growing - s.hold) * s.n_iterations))
         first = min(s.first_horizon, domain.horizon)
         horizon = int(first * (domain.horizon / first) ** share)
         episodes = max(s.episodes, min(4 * s.episodes, s.episodes * domain.horizon // (2 * horizon)))

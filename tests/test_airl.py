@@ -52,6 +52,17 @@ def test_reward_gradient_by_finite_differences(domain):
         assert weight.grad[index].item() == pytest.approx((up - down) / 2e-6, rel=1e-4, abs=1e-8)
 
 
+def test_g_is_bounded_and_has_unit_slope_at_zero(domain):
+    rewards = Rewards(domain, 1, 0.99, [0])
+    x = torch.randn(1, 50, 4, generator=torch.Generator().manual_seed(0))
+    small = rewards.g(x).detach()
+    raw = rewards.strategy_reward(x)[..., 0].detach()
+    assert torch.allclose(small, raw, atol=0.1 * raw.abs().max().item())
+    with torch.no_grad():
+        rewards.strategy_reward.weights[-1].mul_(1e4)
+    assert rewards.g(x).abs().max() <= rewards.bound
+
+
 def test_evaluate_equals_g_at_raw_observations(domain):
     rewards = Rewards(domain, 2, 0.99, [0])
     states = np.random.default_rng(0).normal(size=(3, 5, 4))

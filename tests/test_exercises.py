@@ -15,7 +15,7 @@ def checks(notebook):
 
 
 def failures(cells):
-    return [c for c in cells if any(o.output_type == "error" for o in c.outputs)]
+    return [c for c in cells if any(o.output_type == "error" for o in c.get("outputs", []))]
 
 
 @pytest.mark.parametrize("path", EXERCISES, ids=lambda p: p.parent.name)

@@ -8,7 +8,7 @@ from dmsrd_lite.airl import Rewards
 from dmsrd_lite.demonstrations import load_shipped
 from dmsrd_lite.metrics import correlations_on, divergence_floor, score_policies
 from dmsrd_lite.networks import GaussianPolicies
-from dmsrd_lite.runs import load_record
+from dmsrd_lite.runs import ROOT, load_record
 
 
 @pytest.fixture(scope="module")
@@ -51,3 +51,35 @@ def test_airl_batch_reward_correlates_as_recorded(record, domain):
     correlation = correlations_on(load_shipped(domain, "test_set"), rewards)[0]
     assert correlation == pytest.approx(stored["results"]["correlation"]["AIRL Batch"], abs=1e-3)
     assert correlation >= 0.9
+
+
+def result_rows(results):
+    """The README's result table, made from the record."""
+    floor, own = np.array(results["floor"]), np.array(results["own_log_likelihood"])
+    rows = []
+    for method in ("cloning", "AIRL Single", "AIRL Batch"):
+        kl = np.array(results["kl"][method]) - floor
+        gap = np.array(results["log_likelihood"][method]) - own
+        within = f"{(kl <= 1).sum()} of {len(kl)}"
+        failures, value = np.mean(results["failures"][method]), np.mean(results["returns"][method])
+        rows.append(f"| {method} | {kl.mean():.2f} | {within} | {gap.mean():.3f} | {failures:.0%} | {value:.1f} |")
+    correlation = results["correlation"]
+    rows.append(f"correlates {correlation['AIRL Batch']:.3f} with the true return")
+    rows.append(f"without coverage {correlation['without coverage']:.3f}")
+    rows.append(f"{results['fresh_solved']} of {results['fresh_seeds']} fresh policies")
+    rows.append(f"{results['environment_steps']:,} environment steps per user")
+    return rows
+
+
+def test_readme_shows_the_recorded_numbers(record):
+    text = " ".join((ROOT / "README.md").read_text().split())
+    for row in result_rows(record[0]["results"]):
+        assert row in text
+
+
+def test_a_frozen_reward_teaches_fresh_policies(record):
+    results = record[0]["results"]
+    curves = np.array(results["fresh_curves"])
+    assert curves.shape[1] == results["fresh_seeds"] == 10
+    assert results["fresh_solved"] >= 8
+    assert (curves[-5:].mean(0) > -0.06).sum() >= 8, "the curves must end where the count says"
