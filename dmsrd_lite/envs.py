@@ -48,6 +48,7 @@ class Domain:
     make_batch: Callable[[int, int], object]
     draw_frame: Callable[[np.ndarray], np.ndarray]  # one observation -> (height, width, 3) uint8
     phase_axes: tuple[int, int]  # the two observations that show a strategy best
+    reachable: tuple[float, ...]  # the simulator keeps |s| within this (inf: nothing does)
     reward_axes: tuple[int, int]  # the two observations over which a reward is drawn
     diversity_features: Callable[[np.ndarray], np.ndarray]  # (..., T+1, obs_dim) -> (..., T, n): what people would see
     demonstrators: tuple[Population, ...]  # the demonstrators are chosen from all of these ...
@@ -162,6 +163,7 @@ INVERTED_PENDULUM = Domain(
     make_batch=PendulumBatch,
     draw_frame=draw_pendulum,
     phase_axes=(0, 2),
+    reachable=(1.0, float(np.pi / 2), np.inf, np.inf),
     reward_axes=(1, 0),
     diversity_features=pendulum_features,
     demonstrators=(Population((0.1, 0.05), last_sigma=0.15), Population((0.4, 0.02), last_sigma=0.3)),  # by place; by movement
