@@ -122,12 +122,11 @@ class AIRL:
         for iteration in progress(range(self.iteration, self.settings.n_iterations)):
             clock = [time.perf_counter()]
             seeds = [[*self.seed, part, iteration] for part in (10, 11, 12, 13)]
-            data = rollout(
-                self.domain, self.policies.actor(), self.settings.episodes, seeds[0], horizon=self.horizon, n_threads=self.n_threads
-            )
+            actor = self.policies.actor()
+            data = rollout(self.domain, actor, self.settings.episodes, seeds[0], horizon=self.horizon, n_threads=self.n_threads)
             self.steps += data.n_steps // len(self.x)
             clock.append(time.perf_counter())
-            self.replay.append(self._samples(data, self.policies.actor(), self.settings.replay_samples, seeds[1]))
+            self.replay.append(self._samples(data, actor, self.settings.replay_samples, seeds[1]))
             loss, accuracy = self._discriminate(seeds[2])
             self._average(iteration)
             clock.append(time.perf_counter())

@@ -177,30 +177,33 @@ def _check_demonstrations(arrays: dict, domain: Domain, path: Path) -> list[str]
     return faults
 
 
-def validate_file(path) -> list[str]:
-    """One sentence for every fault of a demonstration file or test set; an empty list when it can be used."""
-    path = Path(path).resolve()
+def _inspect(path: Path) -> tuple[dict[str, np.ndarray], dict, list[str]]:
+    """Arrays, metadata and faults of a file, read once."""
     arrays, faults = _read(path)
     if faults and not arrays:
-        return faults
+        return arrays, {}, faults
     metadata, more = _read_metadata(arrays, path)
     faults += more
     if not faults:
-        check = _check_test_set if "returns" in arrays else _check_demonstrations
-        faults += check(arrays, get_domain(metadata["domain"]), path)
-    return faults
+        domain = get_domain(metadata["domain"])
+        faults += _check_test_set(arrays, metadata, domain, path) if "returns" in arrays else _check_demonstrations(arrays, domain, path)
+    return arrays, metadata, faults
+
+
+def validate_file(path) -> list[str]:
+    """One sentence for every fault of a demonstration file or test set; an empty list when it can be used."""
+    return _inspect(Path(path).resolve())[2]
 
 
 def _load_checked(path, kind: str) -> tuple[dict, dict, Path]:
     path = Path(path).resolve()
-    faults = validate_file(path)
+    arrays, metadata, faults = _inspect(path)
     if faults:
         raise InputError(faults[0] + (f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""))
-    arrays, _ = _read(path)
     found = "test set" if "returns" in arrays else "demonstration set"
     if found != kind:
         raise InputError(f"{path}: is a {found}; expected a {kind}")
-    return arrays, json.loads(str(arrays["metadata"])), path
+    return arrays, metadata, path
 
 
 def load_demonstrations(path, domain: Domain | None = None) -> DemonstrationSet:
@@ -222,12 +225,12 @@ def load_shipped(domain: Domain, kind: str = "demonstrations"):
     return load_test_set(path) if kind in ("test_set", "development_set") else load_demonstrations(path, domain)
 
 
-def _check_test_set(arrays: dict, domain: Domain, path: Path) -> list[str]:
+def _check_test_set(arrays: dict, metadata: dict, domain: Domain, path: Path) -> list[str]:
     missing = [n for n in ("observations", "policy", "snapshot") if n not in arrays]
     if missing:
         return [f"{path}: {name}: is missing; expected an array of a test set" for name in missing]
     faults = _check_array(arrays["returns"], "returns", ("trajectories",), path)
-    if not isinstance(json.loads(str(arrays["metadata"])).get("stride"), int):
+    if not isinstance(metadata.get("stride"), int):
         faults.append(f"{path}: metadata: stride is missing; expected every how many steps a state was kept")
     if faults:
         return faults

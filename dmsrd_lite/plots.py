@@ -12,7 +12,6 @@ from dmsrd_lite.envs import Domain
 # Okabe-Ito, then four darker shades: strategy k has colour k and marker k in every notebook.
 STRATEGY_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#0072B2", "#D55E00", "#F0E442", "#8C510A", "#7A7A7A", "#35236E")
 STRATEGY_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
-METHOD_LINES = {"demonstrator": "-", "cloning": ":", "AIRL Single": "--", "AIRL Batch": "-."}
 STYLE = {
     "figure.facecolor": "white",
     "axes.facecolor": "white",
