@@ -14,7 +14,7 @@ import torch
 
 from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.envs import Domain, InputError
-from dmsrd_lite.networks import BatchedMLP, GaussianPolicies, to_tensor
+from dmsrd_lite.networks import Actor, BatchedMLP, GaussianPolicies, to_tensor
 from dmsrd_lite.policy_optimization import PolicyOptimizer, PPOSettings, clone_behavior
 from dmsrd_lite.rollouts import Rollouts, rollout
 
@@ -39,40 +39,52 @@ class AIRLSettings:
     replay_iterations: int = 10  # policy samples of so many iterations are kept
     replay_samples: int = 2000  # per strategy and iteration
     reward_average: float = 0.9  # decay of the running average of the reward's weights; 0 keeps the last iterate
-    ppo: PPOSettings = PPOSettings(learning_rate=1e-4, sample_fraction=0.5)
+    ppo: PPOSettings = PPOSettings(learning_rate=1e-4, epochs=1, sample_fraction=0.5)
 
 
 class Rewards(torch.nn.Module):
-    """``g_j(s)`` and the shaping term ``h_j(s)`` of M strategies, each an MLP (32, 32) of the state.
+    """Strategy rewards ``g_j(s)``, shaping terms ``h_j(s)`` and, where there are several strategies to share it, a task reward.
 
-    ``g`` is bounded. Unbounded, it correlated with the true return as well, but none of ten fresh policies learned to balance
-    on it frozen, with the same training that succeeds on the bounded one. Why is not settled.
+    ``R_j = g_j``, or ``R_j = R_Task + alpha g_j`` with ``alpha`` > 0 (Equation 1); each network is an MLP (32, 32) of the state.
+    ``R_Task`` starts at zero. Rewards are bounded: unbounded they correlated with the true return as well, but none of ten
+    fresh policies learned to balance on one frozen, with the same training that succeeds on a bounded one. Why is not settled.
     """
 
     bound = 5.0  # nats
 
-    def __init__(self, domain: Domain, n_strategies: int, discount: float, seed: list[int]):
+    def __init__(self, domain: Domain, n_strategies: int, discount: float, seed: list[int], alpha: float = 0.0):
         super().__init__()
-        self.domain, self.discount = domain, discount
+        self.domain, self.discount, self.alpha = domain, discount, alpha
         sizes = (domain.obs_dim, 32, 32, 1)
-        self.strategy_reward = BatchedMLP(n_strategies, sizes, [*seed, 0])
+        self.strategy_reward = BatchedMLP(n_strategies, sizes, [*seed, 0], last_gain=0.1 if alpha else 1.0)
         self.shaping = BatchedMLP(n_strategies, sizes, [*seed, 1])
+        if alpha:
+            self.task_reward = BatchedMLP(1, sizes, [*seed, 2], last_gain=0.0)
 
     def g(self, x: torch.Tensor) -> torch.Tensor:
         """``g_j(s) = b tanh(net_j(s) / b)``: network inputs (M, n, obs_dim) -> (M, n), within the bound b."""
         return self.bound * torch.tanh(self.strategy_reward(x)[..., 0] / self.bound)
 
+    def task(self, x: torch.Tensor) -> torch.Tensor:
+        """``R_Task(s)``, bounded as ``g`` is: (M, n, obs_dim) -> (M, n), one network for all M."""
+        return self.bound * torch.tanh(self.task_reward(x.reshape(1, -1, x.shape[-1])).view(x.shape[:2]) / self.bound)
+
+    def total(self, x: torch.Tensor) -> torch.Tensor:
+        """``R_j(s) = R_Task(s) + alpha g_j(s)``, or ``g_j(s)`` where nothing is shared: (M, n)."""
+        return self.task(x) + self.alpha * self.g(x) if self.alpha else self.g(x)
+
     def f(self, x: torch.Tensor, x_next: torch.Tensor) -> torch.Tensor:
-        """``g(s) + gamma h(s') - h(s)``, (M, n)."""
-        return self.g(x) + self.discount * self.shaping(x_next)[..., 0] - self.shaping(x)[..., 0]
+        """``R_j(s) + gamma h_j(s') - h_j(s)``, (M, n)."""
+        after, before = self.shaping(torch.cat([x_next, x], 1))[..., 0].chunk(2, 1)
+        return self.total(x) + self.discount * after - before
 
     @torch.no_grad()
-    def evaluate(self, observations: np.ndarray) -> np.ndarray:
-        """``g_j`` at raw observations (..., obs_dim), the same for all strategies: (M, ...)."""
+    def evaluate(self, observations: np.ndarray, part: str = "g") -> np.ndarray:
+        """``g``, ``task`` or ``total`` at raw observations (..., obs_dim), the same for all strategies: (M, ...); task: (1, ...)."""
         x = to_tensor(self.domain.network_input(observations)).view(1, -1, self.domain.obs_dim)
-        m = self.strategy_reward.n_strategies
-        parts = [self.g(part.expand(m, -1, -1)) for part in x.split(100_000, dim=1)]  # bounded memory
-        return torch.cat(parts, 1).numpy().reshape(m, *observations.shape[:-1])
+        m = 1 if part == "task" else self.strategy_reward.n_strategies
+        values = [getattr(self, part)(some.expand(m, -1, -1)) for some in x.split(100_000, dim=1)]  # bounded memory
+        return torch.cat(values, 1).numpy().reshape(m, *observations.shape[:-1])
 
 
 def discriminator_loss(demonstration_logits: torch.Tensor, sample_logits: torch.Tensor) -> torch.Tensor:
@@ -86,30 +98,68 @@ class AIRL:
 
     After training: ``policies`` (GaussianPolicies), ``rewards`` (the last iterate), ``averaged_rewards`` (the running
     average, to be used), ``clone`` (Actor of behavioural cloning), ``steps`` per strategy so far.
+    ``networks``: those of an earlier learner (``networks()``) instead of a clone to start from. ``shared``: the rewards of an
+    earlier learner, whose task reward is added to what is learned here, frozen.
     """
 
-    def __init__(self, demonstrations: DemonstrationSet, settings: AIRLSettings, seed: int, n_threads: int = 0):
+    alpha = 0.0  # weight of the strategy rewards beside a shared task reward; 0: no task reward
+
+    def __init__(
+        self,
+        demonstrations: DemonstrationSet,
+        settings: AIRLSettings,
+        seed,
+        n_threads: int = 0,
+        *,
+        networks=None,
+        shared: Rewards | None = None,
+    ):
         if settings.policy_reward not in POLICY_REWARDS:
             raise InputError(f"policy_reward {settings.policy_reward!r}: expected one of {', '.join(POLICY_REWARDS)}")
         self.domain, self.settings, self.n_threads = demonstrations.domain, settings, n_threads
-        self.seed = seed = [seed, 101]  # streams of its own: a generator with the same seed shares nothing
+        self.seed = seed = [*np.atleast_1d(seed).tolist(), 101]  # streams of its own: a generator with the same seed shares nothing
         self.horizon = demonstrations.horizon
         states, actions, successors = demonstrations.transitions()
         self.x, self.x_next = (to_tensor(self.domain.network_input(s)) for s in (states, successors))
         self.actions = to_tensor(actions)
         m = demonstrations.n_demonstrations
-        untrained = GaussianPolicies(self.domain, m, [*seed, 0])
-        cloned = GaussianPolicies(self.domain, m, [*seed, 0])
-        self.cloning_curve = clone_behavior(cloned, self.x, self.actions, [*seed, 1], n_steps=settings.cloning_steps)
-        self.clone, self.untrained = cloned.actor(), untrained.actor()
-        self.policies = cloned if settings.warm_start else untrained
-        self.rewards = Rewards(self.domain, m, settings.discount, [*seed, 2])
-        self.averaged_rewards = Rewards(self.domain, m, settings.discount, [*seed, 2])
-        self.optimizer = PolicyOptimizer(self.policies, replace(settings.ppo, discount=settings.discount), [*seed, 3])
-        self.reward_optimizer = torch.optim.Adam(self.rewards.parameters(), lr=settings.discriminator_rate, fused=True)
+        self.alpha = self.alpha if shared is None else shared.alpha
+        self.policies = GaussianPolicies(self.domain, m, [*seed, 0])
+        self.rewards, self.averaged_rewards = (Rewards(self.domain, m, settings.discount, [*seed, 2], self.alpha) for _ in range(2))
+        if shared is not None:
+            for rewards in (self.rewards, self.averaged_rewards):
+                rewards.task_reward.load_state_dict(shared.task_reward.state_dict())
+                rewards.task_reward.requires_grad_(False)
         self.replay: deque = deque(maxlen=settings.replay_iterations)
         self.coverage: list = []
-        self.steps = self.iteration = 0
+        self.steps = self.iteration = self.n_averaged = 0
+        self.clone, self.untrained = None, self.policies.actor()
+        if networks is None and (settings.warm_start or settings.coverage):
+            cloned = GaussianPolicies(self.domain, m, [*seed, 0])
+            self.cloning_curve = clone_behavior(cloned, self.x, self.actions, [*seed, 1], n_steps=settings.cloning_steps)
+            self.clone = cloned.actor()
+            self.policies = cloned if settings.warm_start else self.policies
+        self.optimizer = PolicyOptimizer(self.policies, replace(settings.ppo, discount=settings.discount), [*seed, 3])
+        self.modules = {
+            "policies": self.policies,
+            "values": self.optimizer.values,
+            "rewards": self.rewards,
+            "averaged": self.averaged_rewards,
+        }
+        if networks is not None:
+            self._restore(networks)
+        learned = [p for p in self.rewards.parameters() if p.requires_grad]
+        self.reward_optimizer = torch.optim.Adam(learned, lr=settings.discriminator_rate, fused=True)
+
+    def networks(self) -> dict[str, torch.Tensor]:
+        """Copies of everything learned or collected that a later learner needs, by name; the leading axis is the strategy's."""
+        found = {f"{name}.{k}": v.clone() for name, module in self.modules.items() for k, v in module.state_dict().items()}
+        return found | {f"coverage.{i}": part for i, part in enumerate(self._joined(self.coverage) if self.coverage else [])}
+
+    def _restore(self, networks: dict[str, torch.Tensor]) -> None:
+        for name, module in self.modules.items():
+            module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in networks.items() if k.startswith(f"{name}.")})
+        self.coverage = [[networks[f"coverage.{i}"] for i in range(3)]] if "coverage.0" in networks else []
 
     def train(self, progress=iter) -> Iterator[dict]:
         """Run the iterations that are left; ``progress`` wraps the range (``tqdm`` for a bar).
@@ -128,7 +178,7 @@ class AIRL:
             clock.append(time.perf_counter())
             self.replay.append(self._samples(data, actor, self.settings.replay_samples, seeds[1]))
             loss, accuracy = self._discriminate(seeds[2])
-            self._average(iteration)
+            self._average()
             clock.append(time.perf_counter())
             demonstrations = (self.x, self.actions)
             self.optimizer.update(
@@ -146,13 +196,13 @@ class AIRL:
             }
 
     def policy_rewards(self, data: Rollouts) -> np.ndarray:
-        """What the policy is paid at each step of ``data``: ``g(s')`` of the state reached, or ``f - log pi``; (M, E, T)."""
+        """What the policy is paid at each step of ``data``: ``R_j(s')`` of the state reached, or ``f - log pi``; (M, E, T)."""
         m, e, t = data.rewards.shape
         x = to_tensor(self.domain.network_input(data.observations)).view(m, e, t + 1, -1)
         before, after = (part.reshape(m, e * t, -1) for part in (x[:, :, :-1], x[:, :, 1:]))
         with torch.no_grad():
             if self.settings.policy_reward == "g":
-                return self.rewards.g(after).view(m, e, t).numpy()
+                return self.rewards.total(after).view(m, e, t).numpy()
             actions = to_tensor(data.executed_actions).view(m, e * t, -1)
             return (self.rewards.f(before, after) - self.policies.log_density(before, actions)).view(m, e, t).numpy()
 
@@ -168,10 +218,12 @@ class AIRL:
     def _explore(self) -> None:
         """Coverage: rollouts of the untrained policy and of the clone at several noise levels, made once."""
         s, everyone = self.settings, range(len(self.x))
-        for level, actor in enumerate([self.untrained, *(self.clone.select(everyone, factor) for factor in s.coverage_noise)]):
-            data = rollout(self.domain, actor, s.coverage_episodes, [*self.seed, 4, level], horizon=self.horizon, n_threads=self.n_threads)
-            self.steps += data.n_steps // len(self.x)
-            self.coverage.append(self._samples(data, actor, s.replay_samples, [*self.seed, 5, level]))
+        levels = [self.untrained, *(self.clone.select(everyone, factor) for factor in s.coverage_noise)]
+        actor = Actor.joined(levels)
+        data = rollout(self.domain, actor, s.coverage_episodes, [*self.seed, 4], horizon=self.horizon, n_threads=self.n_threads)
+        self.steps += data.n_steps // len(self.x)
+        parts = self._samples(data, actor, s.replay_samples, [*self.seed, 5])
+        self.coverage = list(zip(*(part.split(len(self.x)) for part in parts), strict=True))
 
     @staticmethod
     def _joined(sources) -> list[torch.Tensor]:
@@ -185,22 +237,27 @@ class AIRL:
         pools = [self._joined(self.replay)] + ([self._joined(self.coverage)] if s.coverage else [])
         for _ in range(s.discriminator_steps):
             pick = torch.from_numpy(rng.integers(0, self.x.shape[1], s.discriminator_batch))
-            demonstration = self.rewards.f(self.x[:, pick], self.x_next[:, pick]) - log_pi[:, pick]
-            drawn = []
+            drawn = [[part[:, pick] for part in (self.x, self.x_next, log_pi)]]
             for pool in pools:
                 some = torch.from_numpy(rng.integers(0, pool[0].shape[1], s.discriminator_batch // len(pools)))
                 drawn.append([part[:, some] for part in pool])
             x, x_next, density = (torch.cat(parts, 1) for parts in zip(*drawn, strict=True))
-            samples = self.rewards.f(x, x_next) - density
+            logits = self.rewards.f(x, x_next) - density
+            demonstration, samples = logits[:, : s.discriminator_batch], logits[:, s.discriminator_batch :]
             loss = discriminator_loss(demonstration, samples)
             self.reward_optimizer.zero_grad()
-            loss.sum().backward()
+            (loss.sum() + self.regularizer(drawn[1][0], rng)).backward()
             self.reward_optimizer.step()
         accuracy = ((demonstration > 0).float().mean(1) + (samples < 0).float().mean(1)) / 2
         return loss.detach().numpy().copy(), accuracy.numpy()
 
+    def regularizer(self, x_samples: torch.Tensor, rng: np.random.Generator):
+        """What a subclass adds to the loss of one step; ``x_samples`` (M, n, obs_dim) were reached by the policies."""
+        return 0.0
+
     @torch.no_grad()
-    def _average(self, iteration: int) -> None:
-        decay = min(self.settings.reward_average, iteration / (iteration + 3))  # forgets the start faster
+    def _average(self) -> None:
+        decay = min(self.settings.reward_average, self.n_averaged / (self.n_averaged + 3))  # forgets the start faster
         for mean, now in zip(self.averaged_rewards.parameters(), self.rewards.parameters(), strict=True):
             mean.mul_(decay).add_(now, alpha=1 - decay)
+        self.n_averaged += 1

@@ -1,16 +1,18 @@
 """Demonstration sets and test sets as ``.npz`` files: load, check, save. Nothing is ever unpickled."""
 
 import json
+import math
 import os
 import tempfile
 import zipfile
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from dmsrd_lite.envs import DOMAINS, Domain, InputError, get_domain
+from dmsrd_lite.rollouts import Rollouts
 
 SCHEMA_VERSION = 1
 DATA_FOLDER = Path(__file__).resolve().parent.parent / "data"
@@ -53,18 +55,36 @@ class DemonstrationSet:
         parts = self.observations[:, :, :t], self.actions[:, :, :t], self.observations[:, :, 1:]
         return tuple(p.reshape(len(p), -1, p.shape[-1]) for p in parts)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The fields that are there, by name."""
+        return {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
+
     def select(self, indices) -> "DemonstrationSet":
         """The demonstrations ``indices`` (a list), in that order."""
-        arrays = {name: None if getattr(self, name) is None else getattr(self, name)[list(indices)] for name in _ARRAYS}
-        return DemonstrationSet(self.domain, **arrays, metadata=self.metadata)
+        return replace(self, **{name: array[list(indices)] for name, array in self.arrays().items()})
+
+    def joined(self, other: "DemonstrationSet") -> "DemonstrationSet":
+        """These demonstrations and then ``other``'s; an optional field stays where both have it."""
+        mine, others = self.arrays(), other.arrays()
+        both = {name: np.concatenate([mine[name], others[name]]) for name in _ARRAYS if name in mine and name in others}
+        return DemonstrationSet(self.domain, **both, metadata=self.metadata)
 
     def pooled(self) -> "DemonstrationSet":
         """All trajectories as one demonstration, as if one user had given them (AIRL Batch)."""
-        whole = {n: getattr(self, n) for n in _ARRAYS if n != "strategy_labels" and getattr(self, n) is not None}
+        whole = {name: array for name, array in self.arrays().items() if name != "strategy_labels"}
         return DemonstrationSet(self.domain, **{n: a.reshape(1, -1, *a.shape[2:]) for n, a in whole.items()}, metadata=self.metadata)
 
 
 _ARRAYS = ("observations", "actions", "rewards", "strategy_labels", "reset_seeds", "log_likelihoods")
+
+
+def demonstrations_from(data: Rollouts, actor, metadata: dict | None = None) -> DemonstrationSet:
+    """Rollouts of an actor's M policies as M demonstrations, with executed actions and the actor's own log-likelihood of them."""
+    m, k, t = data.rewards.shape
+    executed = data.executed_actions
+    log_pi = actor.log_density(data.observations[:, :, :-1].reshape(m, k * t, -1), executed.reshape(m, k * t, -1))
+    own = log_pi.reshape(m, k, t).astype(np.float64).sum(-1)
+    return DemonstrationSet(data.domain, data.observations, executed, data.rewards, np.arange(m), data.reset_seeds, own, metadata or {})
 
 
 @dataclass(frozen=True)
@@ -252,6 +272,17 @@ def load_test_set(path) -> RewardTestSet:
     )
 
 
+def plain(value):
+    """Numbers, strings, lists and dicts only, so that JSON can hold it; NaN becomes None."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def check_folder(path) -> Path:
     """``path`` resolved, its folder made if need be; ``InputError`` when nothing can be written there."""
     path = Path(path).resolve()
@@ -283,7 +314,7 @@ def write_atomically(path, write) -> Path:
 
 def save_demonstrations(path, demonstrations: DemonstrationSet) -> Path:
     """Write a demonstration set (checked first, atomically, compressed, without pickle)."""
-    arrays = {name: getattr(demonstrations, name) for name in _ARRAYS if getattr(demonstrations, name) is not None}
+    arrays = demonstrations.arrays()
     faults = _check_demonstrations(arrays, demonstrations.domain, Path(path).resolve())
     if faults:
         raise InputError(faults[0])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dmsrd_lite.demonstrations import SCHEMA_VERSION, DemonstrationSet, check_folder, save_demonstrations, write_atomically
+from dmsrd_lite.demonstrations import SCHEMA_VERSION, check_folder, demonstrations_from, save_demonstrations, write_atomically
 from dmsrd_lite.divergence import divergence_table, own_divergence
 from dmsrd_lite.envs import Domain, InputError, Population
 from dmsrd_lite.networks import Actor, BatchedMLP, to_tensor
@@ -105,22 +105,6 @@ def visible_distance(domain: Domain, observations: np.ndarray) -> np.ndarray:
     return np.abs(means[:, None] - means[None]).max(-1)
 
 
-def _demonstration_set(domain: Domain, actor, data: Rollouts, metadata: dict) -> DemonstrationSet:
-    m, k, t = data.rewards.shape
-    executed = data.executed_actions
-    log_pi = actor.log_density(data.observations[:, :, :-1].reshape(m, k * t, -1), executed.reshape(m, k * t, -1))
-    return DemonstrationSet(
-        domain,
-        data.observations,
-        executed,
-        data.rewards,
-        np.arange(m),
-        data.reset_seeds,
-        log_pi.reshape(m, k, t).astype(np.float64).sum(-1),
-        metadata,
-    )
-
-
 def generate_demonstrations(
     domain: Domain,
     seed: int,
@@ -179,7 +163,7 @@ def generate_demonstrations(
         part = Rollouts(
             domain, *(getattr(data, name)[kept] for name in ("observations", "actions", "log_densities", "rewards", "reset_seeds"))
         )
-        save_demonstrations(path, _demonstration_set(domain, actor.select(kept), part, {**metadata, "take": take}))
+        save_demonstrations(path, demonstrations_from(part, actor.select(kept), {**metadata, "take": take}))
     return choice
 
 

@@ -9,7 +9,7 @@ K_NEIGHBORS = 3
 
 
 def _kth_distance(tree: cKDTree, points: np.ndarray, k: int, resolution: float) -> np.ndarray:
-    return np.maximum(tree.query(points, k=[k], p=np.inf)[0][:, 0], resolution)
+    return np.maximum(tree.query(points, k=[k], p=np.inf, workers=-1)[0][:, 0], resolution)
 
 
 def knn_divergence(expert: np.ndarray, rollout: np.ndarray, k: int = K_NEIGHBORS, resolution: float = 1e-9) -> float:
@@ -30,14 +30,13 @@ def trajectory_divergences(domain: Domain, experts: np.ndarray, rollouts: np.nda
 
     The protocol of every number in this workbook: k = 3, Chebyshev norm, raw units, initial states left out.
     """
-    trees = [cKDTree(r[1:]) for r in rollouts]
-    result = np.empty((len(experts), len(rollouts)))
-    for i, states in enumerate(experts):
-        states = states[1:]
-        log_rho = np.log(_kth_distance(cKDTree(states), states, K_NEIGHBORS + 1, domain.knn_resolution))
-        for j, tree in enumerate(trees):
-            log_nu = np.log(_kth_distance(tree, states, K_NEIGHBORS, domain.knn_resolution))
-            result[i, j] = states.shape[1] * np.mean(log_nu - log_rho) + np.log(tree.n / (len(states) - 1))
+    a, t, d = experts[:, 1:].shape
+    states = experts[:, 1:].reshape(a * t, d)
+    rho = np.concatenate([_kth_distance(cKDTree(e[1:]), e[1:], K_NEIGHBORS + 1, domain.knn_resolution) for e in experts])
+    result = np.empty((a, len(rollouts)))
+    for j, rollout in enumerate(rollouts):
+        nu = _kth_distance(cKDTree(rollout[1:]), states, K_NEIGHBORS, domain.knn_resolution)
+        result[:, j] = d * np.log(nu / rho).reshape(a, t).mean(1) + np.log((len(rollout) - 1) / (t - 1))
     return result
 
 

@@ -30,6 +30,14 @@ def divergence_floor(demonstrations: DemonstrationSet, second_take: Demonstratio
     return np.array([demonstration_divergence(domain, a, b) for a, b in zip(shown, second_take.observations, strict=True)])
 
 
+def policy_divergences(actor, demonstrations: DemonstrationSet, seed, *, n_rollouts: int = 10, n_threads: int = 0) -> np.ndarray:
+    """KL of demonstration j, or of the only one, against fresh rollouts of policy j: (n_strategies,) nats."""
+    domain, shown = demonstrations.domain, demonstrations.observations
+    data = rollout(domain, actor, n_rollouts, seed, horizon=demonstrations.horizon, n_threads=n_threads)
+    pairs = zip(np.broadcast_to(shown, (actor.n_strategies, *shown.shape[1:])), data.observations, strict=True)
+    return np.array([demonstration_divergence(domain, d, r) for d, r in pairs])
+
+
 def score_policies(
     actor, demonstrations: DemonstrationSet, seed, *, n_rollouts: int = 20, n_compared: int = 10, n_threads: int = 0
 ) -> dict[str, np.ndarray]:
@@ -51,10 +59,12 @@ def score_policies(
 
 
 def reward_correlation(trajectory_rewards: np.ndarray, returns: np.ndarray) -> float:
-    """Pearson correlation of mean rewards (n,) with true returns (n,)."""
+    """Pearson correlation of mean rewards (n,) with true returns (n,); NaN for a reward that is the same everywhere."""
+    if np.ptp(trajectory_rewards) == 0:
+        return float("nan")
     return float(np.corrcoef(trajectory_rewards, returns)[0, 1])
 
 
-def correlations_on(test_set: RewardTestSet, rewards) -> np.ndarray:
-    """Correlation of each learned reward (anything with ``evaluate``) with the true return on a test set, (M,)."""
-    return np.array([reward_correlation(mean, test_set.returns) for mean in rewards.evaluate(test_set.observations).mean(2)])
+def correlations_on(test_set: RewardTestSet, rewards, part: str = "g") -> np.ndarray:
+    """Correlation of each learned reward, or of a ``part`` of it (``Rewards.evaluate``), with the true return on a test set, (M,)."""
+    return np.array([reward_correlation(mean, test_set.returns) for mean in rewards.evaluate(test_set.observations, part).mean(2)])

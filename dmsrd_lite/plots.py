@@ -6,6 +6,7 @@ import tempfile
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from dmsrd_lite.envs import Domain
 
@@ -71,7 +72,8 @@ def plot_heatmap(table: np.ndarray, ax=None, label: str = "", fmt: str = ".1f", 
     middle = (np.nanmin(table) + np.nanmax(table)) / 2
     for i, row in enumerate(table):
         for j, value in enumerate(row):
-            ax.text(j, i, format(value, fmt), ha="center", va="center", fontsize=7, color="white" if value < middle else "black")
+            if np.isfinite(value):
+                ax.text(j, i, format(value, fmt), ha="center", va="center", fontsize=7, color="white" if value < middle else "black")
     ax.set(xlabel=xlabel, ylabel=ylabel, xticks=range(table.shape[1]), yticks=range(table.shape[0]))
     ax.spines[:].set_visible(False)
     plt.colorbar(image, ax=ax, label=label)
@@ -99,6 +101,35 @@ def plot_per_demonstration(values: dict[str, np.ndarray], ax=None, ylabel: str =
             )
     ax.set(xlabel="demonstration", ylabel=ylabel, xticks=x)
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=8)
+    return ax
+
+
+def plot_weights(weights: np.ndarray, ax=None):
+    """Mixture weights (n, M) as stacked bars, one for each demonstration, in the colours of the strategies."""
+    ax = ax or plt.gca()
+    bottom = np.zeros(len(weights))
+    for j, part in enumerate(weights.T):
+        ax.bar(np.arange(len(weights)), part, bottom=bottom, color=STRATEGY_COLORS[j % 10], edgecolor="white", label=f"strategy {j}")
+        bottom += part
+    ax.set(xlabel="demonstration", ylabel="mixture weight", xticks=range(len(weights)))
+    ax.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize=8)
+    return ax
+
+
+def plot_decisions(records, floor: np.ndarray, ax=None):
+    """KL of the best mixture and of the new policy for each demonstration (``lifelong`` records), and the strategies so far."""
+    ax = ax or plt.gca()
+    x = np.arange(len(records))
+    for name, key, marker, color in (("best mixture", "kl_mix", "o", "#0072B2"), ("new policy", "kl_new", "X", "#D55E00")):
+        ax.plot(x, [np.nan if r[key] is None else max(r[key], 0.01) for r in records], marker, color=color, label=name, linestyle="none")
+    ax.hlines(np.maximum(floor, 0.01), x - 0.4, x + 0.4, color="black", label="floor")
+    ax.plot(x, [r["threshold"] for r in records], color="#7A7A7A", label="threshold", drawstyle="steps-mid")
+    ax.set(xlabel="demonstration, in order of arrival", ylabel="KL (nats)", yscale="log", xticks=x)
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=8)
+    count = ax.twinx()
+    count.step(x, [r["n_strategies"] for r in records], where="mid", color="#7A7A7A", linestyle=":")
+    count.set(ylabel="strategies so far (dotted)", ylim=(0, 2.5 * records[-1]["n_strategies"]))
+    count.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
     return ax
 
 

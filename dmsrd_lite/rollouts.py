@@ -1,5 +1,7 @@
 """Rollouts of many policies in many environments at once: one simulator call per time step for all of them."""
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,12 +60,20 @@ def rollout(domain: Domain, actor, n_episodes: int, seed, *, reset_seeds=None, h
     observations = np.empty((t_end + 1, m, e, domain.obs_dim))
     actions = np.empty((t_end, m, e, domain.action_dim), dtype=np.float32)
     rewards = np.empty((t_end, m, e))
-    batch = domain.make_batch(m * e, n_threads)
-    observations[0] = batch.reset(reset_seeds.ravel()).reshape(m, e, -1)
-    for t in range(t_end):
-        actions[t] = actor.mean(observations[t]) + noise[t]
-        executed = domain.clip_action(actions[t]).reshape(m * e, -1)
-        state, reward = batch.step(executed)
-        observations[t + 1], rewards[t] = state.reshape(m, e, -1), reward.reshape(m, e)
+
+    def simulate(some: slice, threads: int) -> None:
+        part = observations[:, :, some]
+        batch, shape = domain.make_batch(part[0, ..., 0].size, threads), part.shape[1:3]
+        part[0] = batch.reset(reset_seeds[:, some].ravel()).reshape(*shape, -1)
+        for t in range(t_end):
+            actions[t, :, some] = actor.mean(part[t]) + noise[t, :, some]
+            state, reward = batch.step(domain.clip_action(actions[t, :, some]).reshape(-1, domain.action_dim))
+            part[t + 1], rewards[t, :, some] = state.reshape(*shape, -1), reward.reshape(shape)
+
+    # Always the same two halves, so that the bits are too; on two threads one half acts while the other is simulated.
+    halves = [slice(0, e // 2), slice(e // 2, e)] if e > 1 and m * e >= 8 else [slice(0, e)]
+    threads = n_threads or os.cpu_count() or 1
+    with ThreadPoolExecutor(min(threads, len(halves))) as pool:
+        list(pool.map(simulate, halves, [max(1, min(threads // len(halves), m * e // 16))] * len(halves)))
     parts = (np.moveaxis(array, 0, 2) for array in (observations, actions, log_densities, rewards))
     return Rollouts(domain, *parts, reset_seeds)

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import math
 import platform
 import re
 import time
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dmsrd_lite.demonstrations import write_atomically
+from dmsrd_lite.demonstrations import plain, write_atomically
 from dmsrd_lite.envs import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -30,23 +29,12 @@ def check_preset(preset: str) -> str:
     return preset
 
 
-def _plain(value):
-    """Numbers, strings, lists and dicts only, so that JSON can hold it; NaN becomes None."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def hand_over(**results) -> None:
     """Show results as a JSON output of the cell, so that the executed notebook itself carries them."""
     from IPython.display import publish_display_data
 
-    plain = _plain(results)
-    publish_display_data({_MIME: plain, "text/plain": json.dumps(plain, indent=1)})
+    results = plain(results)
+    publish_display_data({_MIME: results, "text/plain": json.dumps(results, indent=1)})
 
 
 def handed_over(notebook) -> dict:
@@ -82,7 +70,7 @@ def save_record(name: str, parameters: dict, results: dict, tensors: dict[str, n
         "machine": {"system": platform.system(), "processor": platform.machine()},
         "results": results,
     }
-    text = json.dumps(_plain(record), indent=1)
+    text = json.dumps(plain(record), indent=1)
     text = re.sub(r"\[\n\s+([^\[\]{}]*?)\n\s+\]", lambda m: "[" + re.sub(r"\s*\n\s*", " ", m[1]) + "]", text)  # a list a line
     binary = save({k: np.ascontiguousarray(v) for k, v in tensors.items()})
     write_atomically(Path(folder) / f"{name}.safetensors", lambda f: f.write(binary))

@@ -57,6 +57,22 @@ def test_pooled_and_selected(small_set):
     assert np.array_equal(small_set.select([1]).actions[0], small_set.actions[1])
 
 
+def test_joined_and_arrays(small_set):
+    bare = dataclasses.replace(small_set.select([1]), rewards=None, log_likelihoods=None, metadata={"seed": 8})
+    assert bare.arrays().keys() == {"observations", "actions", "strategy_labels", "reset_seeds"}
+    assert bare.arrays()["actions"] is bare.actions
+    told = dataclasses.replace(small_set, metadata={"seed": 7})
+    both = told.joined(bare)
+    assert both.arrays().keys() == bare.arrays().keys(), "an optional field stays where both have it"
+    for name, array in both.arrays().items():
+        by_hand = [*getattr(small_set, name), getattr(small_set, name)[1]]
+        assert np.array_equal(array, by_hand), name
+    assert both.n_demonstrations == 3
+    assert both.metadata == {"seed": 7}
+    assert small_set.joined(small_set).arrays().keys() == small_set.arrays().keys()
+    assert small_set.n_demonstrations == 2
+
+
 def change(name, value):
     return lambda arrays: arrays.__setitem__(name, value(arrays[name]))
 

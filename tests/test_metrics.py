@@ -2,9 +2,16 @@ import numpy as np
 import pytest
 from scipy.stats import norm, pearsonr
 
-from dmsrd_lite.demonstrations import RewardTestSet
+from dmsrd_lite.demonstrations import RewardTestSet, demonstrations_from
 from dmsrd_lite.divergence import demonstration_divergence, own_divergence
-from dmsrd_lite.metrics import correlations_on, demonstration_log_likelihood, divergence_floor, reward_correlation, score_policies
+from dmsrd_lite.metrics import (
+    correlations_on,
+    demonstration_log_likelihood,
+    divergence_floor,
+    policy_divergences,
+    reward_correlation,
+    score_policies,
+)
 from dmsrd_lite.networks import SIGMA_FLOOR, Actor, GaussianPolicies
 from dmsrd_lite.rollouts import rollout
 
@@ -21,10 +28,8 @@ def test_log_likelihood_by_hand(small_set, domain):
 
 
 def test_the_demonstrator_reaches_its_own_log_likelihood(domain):
-    from dmsrd_lite.diayn import _demonstration_set
-
     actor = GaussianPolicies(domain, 2, 0).actor()
-    shown = _demonstration_set(domain, actor, rollout(domain, actor, 2, 0, horizon=50), {})
+    shown = demonstrations_from(rollout(domain, actor, 2, 0, horizon=50), actor)
     assert demonstration_log_likelihood(actor, shown) == pytest.approx(shown.log_likelihoods.mean(1), rel=1e-5)
 
 
@@ -51,6 +56,31 @@ def test_scores_are_those_of_the_rollouts(small_set, domain):
     assert np.array_equal(scores["failure_share"], fell)
 
 
+def test_policy_divergences_are_those_of_fresh_rollouts(small_set, domain):
+    """Demonstration j against policy j, or the only demonstration against every policy."""
+    actor, shown = GaussianPolicies(domain, 2, 0).actor(), small_set.observations
+    made = rollout(domain, actor, 3, [4, 1], horizon=50).observations
+    paired = policy_divergences(actor, small_set, [4, 1], n_rollouts=3)
+    assert paired.tolist() == [demonstration_divergence(domain, shown[j], made[j]) for j in range(2)]
+    only = policy_divergences(actor, small_set.select([1]), [4, 1], n_rollouts=3, n_threads=1)
+    assert only.tolist() == [demonstration_divergence(domain, shown[1], made[j]) for j in range(2)]
+    assert paired.tolist() != policy_divergences(actor, small_set, [4, 2], n_rollouts=3).tolist()
+
+
+def test_correlation_of_a_part_of_the_reward(domain):
+    states = np.random.default_rng(0).normal(size=(50, 7, 4))
+    test = RewardTestSet(domain, states, -np.abs(states[..., 1]).mean(1), np.zeros(50), np.zeros(50), {})
+
+    class Parts:
+        def evaluate(self, observations, part="g"):
+            truth = -np.abs(observations[..., 1])
+            return {"task": truth[None], "g": np.stack([-truth, truth]), "total": np.stack([observations[..., 0]])}[part]
+
+    assert correlations_on(test, Parts(), "task") == pytest.approx([1.0])
+    assert correlations_on(test, Parts()) == pytest.approx([-1.0, 1.0])
+    assert correlations_on(test, Parts(), "total") == pytest.approx([pearsonr(states[..., 0].mean(1), test.returns).statistic])
+
+
 def test_correlation_is_pearsons(domain):
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 50))
@@ -59,7 +89,7 @@ def test_correlation_is_pearsons(domain):
     test = RewardTestSet(domain, states, -np.abs(states[..., 1]).mean(1), np.zeros(50), np.zeros(50), {})
 
     class Truth:
-        def evaluate(self, observations):
+        def evaluate(self, observations, part="g"):
             return np.stack([-np.abs(observations[..., 1]), np.abs(observations[..., 1])])
 
     assert correlations_on(test, Truth()) == pytest.approx([1.0, -1.0])

@@ -1,0 +1,250 @@
+"""Dynamic multi-strategy reward distillation (DMSRD): demonstrations arrive one by one. Paper: Algorithm 1."""
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dmsrd_lite.airl import AIRL, AIRLSettings, Rewards
+from dmsrd_lite.demonstrations import DemonstrationSet, plain, write_atomically
+from dmsrd_lite.discrimination import recognized
+from dmsrd_lite.divergence import own_divergence
+from dmsrd_lite.envs import Domain, InputError
+from dmsrd_lite.metrics import policy_divergences
+from dmsrd_lite.mixture import Mixtures, MixtureSettings, search_mixture
+from dmsrd_lite.msrd import MSRD, MSRDSettings
+from dmsrd_lite.networks import GaussianPolicies
+
+
+@dataclass(frozen=True)
+class LifelongSettings:
+    kl_threshold: float = 0.0  # eps: accept a mixture at or below this divergence (nats); 0: a demonstration's own + kl_margin
+    kl_margin: float = 0.5  # nats above the divergence of a demonstration's trajectories from each other
+    add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
+    between_class: bool = True
+    airl: AIRLSettings = AIRLSettings(n_iterations=12)
+    msrd: MSRDSettings = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=24)  # one round after each demonstration
+    mixture: MixtureSettings = MixtureSettings()
+
+    def __post_init__(self):
+        if self.kl_threshold < 0 or not np.isfinite(self.kl_threshold):
+            raise InputError(f"kl_threshold {self.kl_threshold!r}: expected a positive number of nats, or 0 to calibrate it")
+        if self.airl.coverage != self.msrd.coverage:
+            raise InputError("coverage is on in only one of airl and msrd: expected both or neither, because MSRD goes on with AIRL's")
+
+
+@dataclass(frozen=True)
+class LifelongState:
+    """All that is known after some demonstrations; never changed, only replaced.
+
+    demonstrations: all so far, None before the first; weights (n, M); pure (M,): the demonstration that created each
+    strategy; networks: tensors by name (``AIRL.networks``), leading axis M but for the task reward; records: one for each demonstration.
+    """
+
+    domain: Domain
+    seed: int
+    demonstrations: DemonstrationSet | None = None
+    weights: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    pure: tuple[int, ...] = ()
+    networks: dict[str, torch.Tensor] = field(default_factory=dict)
+    records: tuple[dict, ...] = ()
+
+    @property
+    def n_strategies(self) -> int:
+        return len(self.pure)
+
+
+def _is_shared(name: str) -> bool:
+    return ".task_reward." in name
+
+
+class DMSRD:
+    """Algorithm 1. ``learn`` takes demonstrations in any order, at any time, and yields a record for each of them.
+
+    The record's ``steps`` are those of search, AIRL and MSRD; measuring KL before and after is not counted.
+
+    ``state`` is replaced after every demonstration; an error leaves it as it was.
+    """
+
+    def __init__(self, domain: Domain, settings: LifelongSettings, seed: int, n_threads: int = 0, state: LifelongState | None = None):
+        self.domain, self.settings, self.n_threads = domain, settings, n_threads
+        self.state = state or LifelongState(domain, seed)
+        if self.state.domain.name != domain.name:
+            raise InputError(f"the state is of {self.state.domain.name}; expected one of {domain.name}")
+        if self.state.networks and ("coverage.0" in self.state.networks) != settings.msrd.coverage:
+            raise InputError(f"coverage is {settings.msrd.coverage} in the settings, and not so in the state; expected the same in both")
+
+    def policies(self) -> GaussianPolicies:
+        """The M strategies' policies."""
+        return self._load(GaussianPolicies(self.domain, self.state.n_strategies, [0]), "policies")
+
+    def rewards(self) -> Rewards:
+        """The task reward and the M strategy rewards, averaged over the training (``AIRL.averaged_rewards``)."""
+        settings = self.settings.msrd
+        return self._load(Rewards(self.domain, self.state.n_strategies, settings.discount, [0], settings.alpha), "averaged")
+
+    def mixtures(self) -> Mixtures:
+        """What explains each demonstration so far: n mixtures."""
+        return Mixtures(self.policies().actor(), self.state.weights)
+
+    def _load(self, module, name: str):
+        if not self.state.networks:
+            raise InputError("nothing has been learned yet; expected at least one demonstration before this")
+        module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in self.state.networks.items() if k.startswith(f"{name}.")})
+        return module
+
+    def learn(self, demonstrations: DemonstrationSet) -> Iterator[dict]:
+        """Take the demonstrations of a set one after the other; the record of each is also kept in ``state.records``."""
+        self._check(demonstrations)
+        for i in range(demonstrations.n_demonstrations):
+            self.state = self._learn(demonstrations.select([i]))
+            yield self.state.records[-1]
+
+    def _check(self, new: DemonstrationSet) -> None:
+        if new.domain.name != self.domain.name:
+            raise InputError(f"a demonstration of {new.domain.name} arrived; expected one of {self.domain.name}")
+        known = self.state.demonstrations
+        for name in ("observations", "actions") if known is not None else ():
+            before, now = (getattr(some, name).shape[1:] for some in (known, new))
+            if before != now:
+                raise InputError(
+                    f"a demonstration with {name} of shape {now} arrived; expected {before} (trajectories, steps, dimension) as before"
+                )
+
+    def _learn(self, new: DemonstrationSet) -> LifelongState:
+        s, old, started = self.settings, self.state, time.perf_counter()
+        n, m = len(old.weights), old.n_strategies
+        seed, steps = [old.seed, 102, n], {"search": 0, "airl": 0, "msrd": 0}
+        own = own_divergence(self.domain, new.observations[0])
+        threshold = s.kl_threshold or (own if np.isfinite(own) else self.domain.kl_threshold) + s.kl_margin
+        kl_mix = kl_new = float("inf")
+        if m:
+            fit = search_mixture(self.policies().actor(), new, s.mixture, [*seed, 1], n_threads=self.n_threads)
+            kl_mix, weights, steps["search"] = fit.divergence, fit.weights, fit.steps
+        networks, pure, branch = old.networks, old.pure, "mixture"
+        if kl_mix > threshold:
+            learner, kl_new = self._new_strategy(new, [*seed, 2])
+            steps["airl"] = learner.steps
+            branch = "mixture, better than a new strategy"
+            if not kl_mix < kl_new:
+                branch, pure, weights = "new strategy", (*pure, n), np.eye(m + 1)[m]
+                networks = self._with_strategy(learner.networks())
+        table = np.zeros((n + 1, len(pure)))
+        table[:n, :m], table[n] = old.weights, weights
+        known = new if old.demonstrations is None else old.demonstrations.joined(new)
+        state = replace(old, demonstrations=known, weights=table, pure=pure, networks=networks)
+        thresholds = [*(r["threshold"] for r in old.records), threshold]
+        before, searched = self._divergences(state, [*seed, 3]), {}
+        if len(pure) > 1:
+            networks, steps["msrd"] = self._round(state, [*seed, 4])
+            state = replace(state, networks=networks)
+        after = self._divergences(state, [*seed, 3]) if len(pure) > 1 else before
+        risen = (before <= thresholds) & (after > thresholds)
+        for i in set(np.flatnonzero(risen)) - {*pure, n}:  # a mixture that its own strategies have moved away from
+            one, policies = known.select([i]), self._at(state).policies().actor()
+            fit = search_mixture(policies, one, s.mixture, [*seed, 5, i], incumbent=table[i], n_threads=self.n_threads)
+            searched[i], steps["search"] = [after[i], fit.divergence], steps["search"] + fit.steps
+            table[i] = fit.weights if fit.divergence < after[i] else table[i]
+        record = {
+            "demonstration": n,
+            "branch": branch,
+            "kl_mix": kl_mix,
+            "kl_new": kl_new,
+            "own_divergence": own,
+            "threshold": threshold,
+            "weights": weights,
+            "n_strategies": len(pure),
+            "steps": steps,
+            "kl_before_round": before,
+            "kl_after_round": after,
+            "searched_again": searched,
+            "recognized": recognized(self._at(state).rewards().evaluate(known.observations).mean((2, 3)), pure),
+            "seconds": time.perf_counter() - started,
+        }
+        return replace(state, records=(*old.records, plain(record)))
+
+    def _new_strategy(self, new: DemonstrationSet, seed) -> tuple[AIRL, float]:
+        """AIRL on the new demonstration alone, and the KL of its policy."""
+        s = self.settings
+        shared = Rewards(self.domain, 1, s.airl.discount, seed, s.msrd.alpha)  # its task reward is zero
+        if self.state.networks and s.add_task_reward:
+            shared = self.rewards()
+        learner = AIRL(new, s.airl, seed, self.n_threads, shared=shared)
+        for _ in learner.train():
+            pass
+        return learner, float(policy_divergences(learner.policies.actor(), new, [*seed, 9], n_threads=self.n_threads)[0])
+
+    def _with_strategy(self, new: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        old = self.state.networks
+        return {k: (old[k] if _is_shared(k) else torch.cat([old[k], v])) if old else v for k, v in new.items()}
+
+    def _round(self, state: LifelongState, seed) -> tuple[dict[str, torch.Tensor], int]:
+        """MSRD on the pure demonstrations with BCD on all of them; returns the networks and the steps of all strategies."""
+        s, pure = self.settings, state.pure
+        between = (state.demonstrations, state.weights, pure) if s.between_class else None
+        learner = MSRD(state.demonstrations.select(pure), s.msrd, seed, self.n_threads, networks=state.networks, between=between)
+        learner.n_averaged = s.msrd.n_iterations * sum(r["n_strategies"] > 1 for r in state.records)
+        for _ in learner.train():
+            pass
+        learner.settle()
+        return learner.networks(), learner.steps * len(pure)
+
+    def _at(self, state: LifelongState) -> "DMSRD":
+        return DMSRD(self.domain, self.settings, state.seed, self.n_threads, state)
+
+    def _divergences(self, state: LifelongState, seed) -> np.ndarray:
+        """KL of every demonstration so far under what explains it, (n,)."""
+        return policy_divergences(self._at(state).mixtures(), state.demonstrations, seed, n_threads=self.n_threads)
+
+
+_FORMAT, _VERSION = "dmsrd_lite lifelong state", 1
+
+
+def save_state(path, state: LifelongState) -> Path:
+    """Write a state (safetensors, atomically, without pickle): arrays and networks, everything else as JSON in the header."""
+    from safetensors.torch import save
+
+    known = {} if state.demonstrations is None else state.demonstrations.arrays()
+    tensors = {f"demonstrations.{k}": torch.from_numpy(v.copy()) for k, v in known.items()}
+    tensors |= {f"networks.{k}": v.contiguous() for k, v in state.networks.items()} | {"weights": torch.from_numpy(state.weights)}
+    header = {"format": _FORMAT, "version": _VERSION, "domain": state.domain.name, "seed": state.seed, "pure": state.pure,
+              "records": state.records, "metadata": state.demonstrations.metadata if known else {}}  # fmt: skip
+    binary = save(tensors, metadata={k: json.dumps(plain(v)) for k, v in header.items()})
+    return write_atomically(path, lambda file: file.write(binary))
+
+
+def load_state(path, domain: Domain) -> LifelongState:
+    """Read a state; ``InputError`` when it is cut short, of another version or of another domain."""
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path).resolve()
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = {k: json.loads(v) for k, v in (file.metadata() or {}).items()}
+            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
+    except (OSError, ValueError, SafetensorError) as error:
+        raise InputError(f"{path}: cannot be read ({type(error).__name__}); expected a state written by save_state, whole") from None
+    if header.get("format") != _FORMAT or header.get("version") != _VERSION:
+        raise InputError(
+            f"{path}: is a {header.get('format')!r} of version {header.get('version')!r}; expected {_FORMAT!r} of version {_VERSION}"
+        )
+    if header["domain"] != domain.name:
+        raise InputError(f"{path}: holds a state of {header['domain']}; expected {domain.name}")
+
+    def group(name):
+        return {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
+
+    shown = {k: v.numpy() for k, v in group("demonstrations").items()}
+    return LifelongState(
+        domain,
+        header["seed"],
+        DemonstrationSet(domain, **shown, metadata=header["metadata"]) if shown else None,
+        tensors["weights"].numpy(),
+        tuple(header["pure"]),
+        group("networks"),
+        tuple(header["records"]),
+    )

@@ -1,0 +1,112 @@
+"""Policy mixtures: a demonstration explained as a blend of known strategies. Paper: section "Policy mixture optimisation"."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dmsrd_lite.demonstrations import DemonstrationSet
+from dmsrd_lite.envs import InputError
+from dmsrd_lite.metrics import policy_divergences
+from dmsrd_lite.networks import Actor, gaussian_log_density
+
+
+def check_weights(weights, n_strategies: int) -> np.ndarray:
+    """``weights`` as an array (K, n_strategies) whose rows lie on the simplex, or ``InputError``; a single row may be flat."""
+    table = np.atleast_2d(np.asarray(weights, dtype=np.float64))
+    if n_strategies < 1 or table.size == 0:
+        raise InputError("a mixture of no strategies: expected at least one strategy and one row of weights")
+    if table.ndim != 2 or table.shape[1] != n_strategies:
+        raise InputError(f"mixture weights of shape {table.shape}: expected {n_strategies} weights in a row, one for each strategy")
+    faulty = ~np.isfinite(table) | (table < -1e-9)
+    if faulty.any():
+        raise InputError(f"mixture weights {table[faulty][0]:g}: expected weights of at least 0")
+    wrong = np.abs(table.sum(1) - 1) > 1e-6
+    if wrong.any():
+        raise InputError(f"mixture weights that sum to {table[wrong][0].sum():g}: expected a sum of 1")
+    return np.maximum(table, 0.0)
+
+
+class Mixtures:
+    """K mixtures ``pi_w(a|s) = N(sum_j w_j mu_j(s), (sum_j w_j sigma_j)^2)`` of an actor's M policies, to act and to score with.
+
+    One Gaussian around the weighted mean: what is executed is what the likelihood counts, and a pure weight is the pure policy.
+    weights (K, M). Stands in for an ``Actor`` of K policies.
+    """
+
+    def __init__(self, actor: Actor, weights):
+        self.actor, self.weights = actor, check_weights(weights, actor.n_strategies).astype(np.float32)
+        self.sigma = np.einsum("km,mua->kua", self.weights, actor.sigma)  # (K, 1, action_dim)
+
+    @property
+    def n_strategies(self) -> int:
+        return len(self.weights)
+
+    def mean(self, observations: np.ndarray) -> np.ndarray:
+        """Observations (K, E, obs_dim) -> (K, E, action_dim)."""
+        k, e = observations.shape[:2]
+        means = self.actor.mean(observations.reshape(1, k * e, -1))  # (M, K * E, action_dim)
+        return np.einsum("km,mkea->kea", self.weights, means.reshape(-1, k, e, means.shape[-1]))
+
+    def log_density(self, observations: np.ndarray, actions: np.ndarray, sigma_floor: float = 0.0) -> np.ndarray:
+        """``log pi_w(a|s)``: (K, n, obs_dim), (K, n, action_dim) -> (K, n); sigma is at least ``sigma_floor``."""
+        return gaussian_log_density(actions, self.mean(observations), np.maximum(self.sigma, sigma_floor))
+
+
+@dataclass(frozen=True)
+class MixtureSettings:
+    n_candidates: int = 64  # drawn from the simplex, beside the pure strategies and the incumbent
+    n_refinements: int = 32  # drawn around the best of them
+    concentration: float = 40.0  # of the refinements: Dirichlet(concentration * best + 0.1)
+    search_rollouts: int = 2  # per candidate, to choose the finalists
+    n_finalists: int = 6
+    final_rollouts: int = 10  # of the protocol (``policy_divergences``)
+
+
+@dataclass(frozen=True)
+class MixtureFit:
+    """The best mixture: weights (M,), its divergence in nats on fresh rollouts, and what the search saw."""
+
+    weights: np.ndarray
+    divergence: float
+    candidates: np.ndarray  # (n, M)
+    divergences: np.ndarray  # (n,), of the few rollouts of the search
+    steps: int  # environment steps spent
+
+
+def search_mixture(
+    actor: Actor, demonstration: DemonstrationSet, settings: MixtureSettings, seed, *, incumbent=None, n_threads: int = 0
+) -> MixtureFit:
+    """Random search on the simplex for the mixture whose rollouts are nearest to one demonstration (a set of one).
+
+    Candidates: the pure strategies, the incumbent, Dirichlet(1) draws over all strategies and over every pair's edge, then
+    refinements around the best; each round is one batch of rollouts. The finalists are measured by the protocol of
+    every KL here, and the winner once more on rollouts of its own, because the least of several noisy numbers is too low.
+    """
+    m, s, rng = actor.n_strategies, settings, np.random.default_rng(seed)
+    if demonstration.n_demonstrations != 1:
+        raise InputError(
+            f"a mixture is searched for one demonstration at a time; expected a set of 1, not {demonstration.n_demonstrations}"
+        )
+    drawn = rng.dirichlet(np.ones(m), s.n_candidates)
+    for row in drawn[::2]:  # half of them are sparse: few strategies in a mixture are the common case
+        kept = rng.permutation(m)[: 2 + rng.integers(2)]
+        row[np.setdiff1d(np.arange(m), kept)] = 0.0
+    drawn /= drawn.sum(1, keepdims=True)
+    given = np.eye(m) if incumbent is None else np.vstack([np.eye(m), check_weights(incumbent, m)[:1]])
+    candidates = np.vstack([given, drawn]) if m > 1 else given
+    seeds, steps = [*np.atleast_1d(seed).tolist()], 0
+
+    def measure(weights, part, n_rollouts):
+        nonlocal steps
+        steps += len(weights) * n_rollouts * demonstration.horizon
+        return policy_divergences(Mixtures(actor, weights), demonstration, [*seeds, part], n_rollouts=n_rollouts, n_threads=n_threads)
+
+    divergences = measure(candidates, 1, s.search_rollouts)
+    if m > 1 and s.n_refinements:
+        around = rng.dirichlet(s.concentration * candidates[divergences.argmin()] + 0.1, s.n_refinements)
+        candidates, divergences = np.vstack([candidates, around]), np.append(divergences, measure(around, 2, s.search_rollouts))
+    finalists = np.argsort(divergences, kind="stable")[: s.n_finalists]
+    if incumbent is not None:
+        finalists = np.union1d(finalists, [m])
+    best = candidates[finalists[measure(candidates[finalists], 3, s.final_rollouts).argmin()]]
+    return MixtureFit(best, float(measure(best[None], 4, s.final_rollouts)[0]), candidates, divergences, steps)
