@@ -2,11 +2,11 @@
 
 import base64
 import os
+import sys
 import tempfile
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 
 from dmsrd_lite.envs import Domain
 
@@ -104,12 +104,19 @@ def plot_per_demonstration(values: dict[str, np.ndarray], ax=None, ylabel: str =
     return ax
 
 
-def plot_weights(weights: np.ndarray, ax=None):
-    """Mixture weights (n, M) as stacked bars, one for each demonstration, in the colours of the strategies."""
+def plot_weights(weights: np.ndarray, ax=None, labels=None):
+    """Mixture weights (n, M) as stacked bars, one for each demonstration, in the colours of the strategies (default names: 0, 1, ...)."""
     ax = ax or plt.gca()
     bottom = np.zeros(len(weights))
     for j, part in enumerate(weights.T):
-        ax.bar(np.arange(len(weights)), part, bottom=bottom, color=STRATEGY_COLORS[j % 10], edgecolor="white", label=f"strategy {j}")
+        ax.bar(
+            np.arange(len(weights)),
+            part,
+            bottom=bottom,
+            color=STRATEGY_COLORS[j % 10],
+            edgecolor="white",
+            label=f"strategy {labels[j] if labels else j}",
+        )
         bottom += part
     ax.set(xlabel="demonstration", ylabel="mixture weight", xticks=range(len(weights)))
     ax.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize=8)
@@ -124,12 +131,9 @@ def plot_decisions(records, floor: np.ndarray, ax=None):
         ax.plot(x, [np.nan if r[key] is None else max(r[key], 0.01) for r in records], marker, color=color, label=name, linestyle="none")
     ax.hlines(np.maximum(floor, 0.01), x - 0.4, x + 0.4, color="black", label="floor")
     ax.plot(x, [r["threshold"] for r in records], color="#7A7A7A", label="threshold", drawstyle="steps-mid")
-    ax.set(xlabel="demonstration, in order of arrival", ylabel="KL (nats)", yscale="log", xticks=x)
+    ticks = [f"{i}\n({r['n_strategies']})" for i, r in enumerate(records)]
+    ax.set(xlabel="demonstration, in order of arrival (strategies so far)", ylabel="KL (nats)", yscale="log", xticks=x, xticklabels=ticks)
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=8)
-    count = ax.twinx()
-    count.step(x, [r["n_strategies"] for r in records], where="mid", color="#7A7A7A", linestyle=":")
-    count.set(ylabel="strategies so far (dotted)", ylim=(0, 2.5 * records[-1]["n_strategies"]))
-    count.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
     return ax
 
 
@@ -139,6 +143,19 @@ def plot_correlation(trajectory_rewards: np.ndarray, returns: np.ndarray, ax=Non
     ax.plot(returns[::every], trajectory_rewards[::every], ".", markersize=2, alpha=0.4, color="#0072B2")
     ax.set(xlabel="true return of the trajectory", ylabel="mean learned reward")
     return ax
+
+
+def slider(function, **controls) -> None:
+    """Sliders over a drawing function's arguments in a live notebook; in a headless run one call with its defaults.
+
+    Nobody moves a slider there, and nbclient, which papermill runs on, now and then waits forever for a widget's output.
+    """
+    if any("hist_file=:memory:" in argument for argument in sys.argv):  # nbclient starts its kernels so
+        function()
+        return
+    from ipywidgets import interact
+
+    interact(function, **controls)
 
 
 def film(domain: Domain, observations: np.ndarray, columns: int = 5, every: int = 2) -> np.ndarray:

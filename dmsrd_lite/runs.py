@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = ROOT / "notebooks"
 RECORDS = ROOT / "papermill_runs" / "records"
 PRESETS = ("quick", "full")
-CELL_LIMIT = 3600  # seconds; a cell that takes longer has hung
+CELL_LIMITS = {"quick": 600, "full": 3600}  # seconds; a cell that takes longer has hung
 _MIME = "application/vnd.dmsrd-lite.result+json"
 
 
@@ -103,7 +103,13 @@ def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT) -> 
     start, error = time.perf_counter(), ""
     try:
         papermill.execute_notebook(
-            str(path), str(output), parameters, progress_bar=False, kernel_name="python3", cwd=str(folder), execution_timeout=CELL_LIMIT
+            str(path),
+            str(output),
+            parameters,
+            progress_bar=False,
+            kernel_name="python3",
+            cwd=str(folder),
+            execution_timeout=CELL_LIMITS.get(parameters.get("preset"), CELL_LIMITS["full"]),
         )
     except PapermillExecutionError as failure:
         error = f"cell {failure.exec_count}: {failure.ename}: {failure.evalue}"
