@@ -78,7 +78,7 @@ def search_mixture(
 ) -> MixtureFit:
     """Random search on the simplex for the mixture whose rollouts are nearest to one demonstration (a set of one).
 
-    Candidates: the pure strategies, the incumbent, Dirichlet(1) draws over all strategies and over every pair's edge, then
+    Candidates: the pure strategies, the incumbent, Dirichlet(1) draws, half of them cut down to two or three strategies, then
     refinements around the best; each round is one batch of rollouts. The finalists are measured by the protocol of
     every KL here, and the winner once more on rollouts of its own, because the least of several noisy numbers is too low.
     """
