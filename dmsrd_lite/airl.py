@@ -14,7 +14,7 @@ import torch
 
 from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.envs import Domain, InputError
-from dmsrd_lite.networks import Actor, BatchedMLP, GaussianPolicies, to_tensor
+from dmsrd_lite.networks import Actor, BatchedMLP, GaussianPolicies, to_tensor, under
 from dmsrd_lite.policy_optimization import PolicyOptimizer, PPOSettings, clone_behavior
 from dmsrd_lite.rollouts import Rollouts, rollout
 
@@ -158,7 +158,7 @@ class AIRL:
 
     def _restore(self, networks: dict[str, torch.Tensor]) -> None:
         for name, module in self.modules.items():
-            module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in networks.items() if k.startswith(f"{name}.")})
+            module.load_state_dict(under(name, networks))
         self.coverage = [[networks[f"coverage.{i}"] for i in range(3)]] if "coverage.0" in networks else []
 
     def train(self, progress=iter) -> Iterator[dict]:

@@ -17,7 +17,7 @@ from dmsrd_lite.envs import Domain, InputError
 from dmsrd_lite.metrics import policy_divergences
 from dmsrd_lite.mixture import Mixtures, MixtureSettings, search_mixture
 from dmsrd_lite.msrd import MSRD, MSRDSettings
-from dmsrd_lite.networks import GaussianPolicies
+from dmsrd_lite.networks import GaussianPolicies, under
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class DMSRD:
     def _load(self, module, name: str):
         if not self.state.networks:
             raise InputError("nothing has been learned yet; expected at least one demonstration before this")
-        module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in self.state.networks.items() if k.startswith(f"{name}.")})
+        module.load_state_dict(under(name, self.state.networks))
         return module
 
     def learn(self, demonstrations: DemonstrationSet) -> Iterator[dict]:
@@ -235,16 +235,13 @@ def load_state(path, domain: Domain) -> LifelongState:
     if header["domain"] != domain.name:
         raise InputError(f"{path}: holds a state of {header['domain']}; expected {domain.name}")
 
-    def group(name):
-        return {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
-
-    shown = {k: v.numpy() for k, v in group("demonstrations").items()}
+    shown = {k: v.numpy() for k, v in under("demonstrations", tensors).items()}
     return LifelongState(
         domain,
         header["seed"],
         DemonstrationSet(domain, **shown, metadata=header["metadata"]) if shown else None,
         tensors["weights"].numpy(),
         tuple(header["pure"]),
-        group("networks"),
+        under("networks", tensors),
         tuple(header["records"]),
     )

@@ -14,7 +14,7 @@ from dmsrd_lite.lifelong import DMSRD, LifelongSettings
 from dmsrd_lite.metrics import correlations_on, score_policies
 from dmsrd_lite.mixture import Mixtures
 from dmsrd_lite.msrd import MSRD, MSRDSettings
-from dmsrd_lite.networks import GaussianPolicies
+from dmsrd_lite.networks import GaussianPolicies, under
 
 METHODS = ("cloning", "AIRL Single", "AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD")
 
@@ -115,7 +115,7 @@ def restore(tensors: dict[str, np.ndarray], shown: DemonstrationSet, alpha: floa
     m = tensors["weights"].shape[1]
     modules = {"policy": GaussianPolicies(shown.domain, m, [0]), "reward": Rewards(shown.domain, m, 0.99, [0], alpha)}
     for name, module in modules.items():
-        kept = {k.removeprefix(f"{name}."): torch.tensor(v) for k, v in tensors.items() if k.startswith(f"{name}.")}
+        kept = {k: torch.tensor(v) for k, v in under(name, tensors).items()}
         module.load_state_dict(kept, strict=False)  # shaping is not kept
     known = any(k.startswith("reward.") for k in tensors)
     part = "task" if alpha else "g"

@@ -113,6 +113,11 @@ class Actor:
         )
 
 
+def under(name: str, tensors: dict) -> dict:
+    """The entries of ``tensors`` whose names start with ``name.``, without that prefix."""
+    return {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
+
+
 def to_tensor(x: np.ndarray) -> torch.Tensor:
     """A float32 tensor with its own contiguous memory."""
     return torch.from_numpy(np.ascontiguousarray(x, dtype=np.float32))
