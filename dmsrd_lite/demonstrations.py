@@ -91,8 +91,8 @@ def demonstrations_from(data: Rollouts, actor, metadata: dict | None = None) -> 
 class RewardTestSet:
     """Trajectories from failure to success with their true returns, to evaluate a reward.
 
-    observations (n, T/stride, obs_dim), every ``stride``-th new state; returns (n,) of the whole trajectory;
-    policy (n,), snapshot (n,): who made it and when in training.
+    observations (n, T/stride, obs_dim), every ``stride``-th new state; returns (n,) of the whole trajectory; policy (n,),
+    snapshot (n,): who made it and when in training; returns_every_step (n,), or None, when rewards are never stopped.
     """
 
     domain: Domain
@@ -101,6 +101,7 @@ class RewardTestSet:
     policy: np.ndarray
     snapshot: np.ndarray
     metadata: dict
+    returns_every_step: np.ndarray | None = None
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -255,8 +256,8 @@ def _check_test_set(arrays: dict, metadata: dict, domain: Domain, path: Path) ->
     if faults:
         return faults
     n = len(arrays["returns"])
-    shapes = {"observations": (n, "steps", domain.obs_dim), "policy": (n,), "snapshot": (n,)}
-    return [fault for name, shape in shapes.items() for fault in _check_array(arrays[name], name, shape, path)]
+    shapes = {"observations": (n, "steps", domain.obs_dim), "policy": (n,), "snapshot": (n,), "returns_every_step": (n,)}
+    return [fault for name, shape in shapes.items() if name in arrays for fault in _check_array(arrays[name], name, shape, path)]
 
 
 def load_test_set(path) -> RewardTestSet:
@@ -269,6 +270,7 @@ def load_test_set(path) -> RewardTestSet:
         arrays["policy"],
         arrays["snapshot"],
         metadata,
+        arrays["returns_every_step"].astype(np.float64) if "returns_every_step" in arrays else None,
     )
 
 

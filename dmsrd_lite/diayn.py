@@ -9,11 +9,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dmsrd_lite.demonstrations import SCHEMA_VERSION, check_folder, demonstrations_from, save_demonstrations, write_atomically
+from dmsrd_lite.demonstrations import (
+    SCHEMA_VERSION,
+    DemonstrationSet,
+    check_folder,
+    demonstrations_from,
+    save_demonstrations,
+    write_atomically,
+)
 from dmsrd_lite.divergence import divergence_table, own_divergence
 from dmsrd_lite.envs import Domain, InputError, Population
+from dmsrd_lite.metrics import policy_divergences
 from dmsrd_lite.networks import Actor, BatchedMLP, to_tensor
-from dmsrd_lite.policy_optimization import TrainingSettings, train_policies
+from dmsrd_lite.policy_optimization import PPOSettings, TrainingSettings, train_policies
 from dmsrd_lite.rollouts import Rollouts, draw_reset_seeds, rollout
 
 TEST_SEED, DEVELOPMENT_SEED, POPULATION_SEED = 1000, 2000, 3000  # added to a generation's seed: the trainings share nothing
@@ -27,6 +35,11 @@ class DiaynSettings:
     discriminator_rate: float = 1e-3
     training: TrainingSettings = TrainingSettings(n_strategies=20, n_iterations=160, episodes=4, last_rate=0.1)
     acting_noise: float = 0.8  # demonstrators act with this share of the sigma they were trained with
+
+
+_FLIGHT = TrainingSettings(n_strategies=20, n_iterations=240, episodes=6, first_horizon=500, first_sigma=0.6, last_rate=0.1,
+                           last_discount=0.998, ppo=PPOSettings(epochs=4, minibatch=500))  # fmt: skip
+SETTINGS = {"inverted_pendulum": DiaynSettings(), "lunar_lander": DiaynSettings(diversity_weight=0.03, training=_FLIGHT)}
 
 
 class StrategyDiscriminator:
@@ -105,6 +118,20 @@ def visible_distance(domain: Domain, observations: np.ndarray) -> np.ndarray:
     return np.abs(means[:, None] - means[None]).max(-1)
 
 
+def distances(domain: Domain, shown: DemonstrationSet, actor, seed) -> tuple[np.ndarray, np.ndarray]:
+    """How far strategies are apart, (m, m) nats, and each one's distance from itself, (m,).
+
+    Demonstrations against each other; in a domain with ``matched_starts`` against rollouts of every policy from the
+    demonstration's starts, less what its own policy reaches from there.
+    """
+    if not domain.matched_starts:
+        table = divergence_table(domain, shown.observations)
+        return table, np.diag(table)
+    k = shown.observations.shape[1]
+    table = np.array([policy_divergences(actor, shown.select([i]), [*seed, i], n_rollouts=k) for i in range(shown.n_demonstrations)])
+    return table - np.diag(table)[:, None], np.diag(table)
+
+
 def generate_demonstrations(
     domain: Domain,
     seed: int,
@@ -117,12 +144,12 @@ def generate_demonstrations(
 ) -> dict:
     """Train demonstrators, keep the most distinct of the successful ones, write their demonstrations and a second take.
 
-    Success: every trajectory of both takes returns at least ``domain.success_return`` and none fails, and a
-    demonstrator's own trajectories are within ``domain.kl_threshold`` of each other. Of the successful ones those are
-    kept that look most different, at least ``domain.kl_margin`` nats apart. Returns the choice as written into the
-    files' metadata; ``InputError`` when too few are left (nothing is written then).
+    Success: every trajectory of both takes returns at least ``domain.success_return`` and none fails, and (without
+    ``matched_starts``) a demonstrator's own trajectories are within ``domain.kl_threshold`` of each other. Of the
+    successful ones those are kept that look most different, at least ``domain.kl_margin`` nats apart (``distances``).
+    Returns the choice as written into the files' metadata; ``InputError`` when too few are left (nothing is written then).
     """
-    settings = settings or DiaynSettings()
+    settings = settings or SETTINGS[domain.name]
     takes = {take: check_folder(Path(folder) / f"{domain.name}_{take}.npz") for take in ("demonstrations", "second_take")}
     actors = []
     for number, population in enumerate(domain.demonstrators):
@@ -133,17 +160,18 @@ def generate_demonstrations(
     actor = actor.select(everyone, settings.acting_noise)
     starts = draw_reset_seeds(np.random.default_rng([seed, 7]), len(everyone), n_trajectories)
     shown = [rollout(domain, actor, n_trajectories, [seed, 8, number], reset_seeds=starts) for number in range(len(takes))]
-    fits = np.array([own_divergence(domain, states) <= domain.kl_threshold for states in shown[0].observations])
+    fits = np.array([domain.matched_starts or own_divergence(domain, o) <= domain.kl_threshold for o in shown[0].observations])
     for data in shown:
-        fits &= ~domain.failed(data.observations).any((1, 2)) & (data.returns >= domain.success_return).all(1)
+        fits &= ~data.failed.any((1, 2)) & (data.returns >= domain.success_return).all(1)
     kept, smallest = np.flatnonzero(fits), 0.0
+    first = demonstrations_from(shown[0], actor)
     if len(kept) >= n_kept:
-        states = shown[0].observations[kept]
-        table = divergence_table(domain, states)
+        table, own = distances(domain, first.select(kept), actor.select(kept), [seed, 10])
         nearness = table / domain.kl_margin - 1  # below 0: too near, and dropped first
-        pick = most_distinct(np.where(np.minimum(nearness, nearness.T) < 0, nearness, visible_distance(domain, states)), n_kept)
+        look = visible_distance(domain, first.observations[kept])
+        pick = most_distinct(np.where(np.minimum(nearness, nearness.T) < 0, nearness, look), n_kept)
         smallest = table[np.ix_(pick, pick)][~np.eye(n_kept, dtype=bool)].min()
-        kept, own = kept[pick], np.diag(table)[pick].max()
+        kept, own = kept[pick], own[pick].max()
     if smallest < domain.kl_margin:
         raise InputError(
             f"only {fits.sum()} of {len(everyone)} demonstrators of {domain.name} with seed {seed} succeeded, the nearest two kept "
@@ -160,10 +188,8 @@ def generate_demonstrations(
     metadata = {"seed": seed, "choice": choice, "settings": dataclasses.asdict(settings),
                 "made_by": f"python -m dmsrd_lite generate {domain.name} --seed {seed}"}  # fmt: skip
     for (take, path), data in zip(takes.items(), shown, strict=True):
-        part = Rollouts(
-            domain, *(getattr(data, name)[kept] for name in ("observations", "actions", "log_densities", "rewards", "reset_seeds"))
-        )
-        save_demonstrations(path, demonstrations_from(part, actor.select(kept), {**metadata, "take": take}))
+        one = demonstrations_from(data, actor, {**metadata, "take": take}).select(kept)
+        save_demonstrations(path, dataclasses.replace(one, strategy_labels=np.arange(n_kept)))
     return choice
 
 
@@ -180,17 +206,21 @@ def generate_test_set(
 ) -> Path:
     """Trajectories of ten new policies at ``n_snapshots`` moments of a separate training, from failure to success.
 
-    Writes ``observations`` (n, T/stride, obs_dim) in half precision, ``returns``, ``policy``, ``snapshot``, ``metadata``.
+    Writes the arrays of ``RewardTestSet``, ``observations`` in half precision.
     """
     path = check_folder(path)
-    settings = settings or DiaynSettings(training=TrainingSettings(n_strategies=10, n_iterations=120))
+    if settings is None:
+        usual = SETTINGS[domain.name]
+        training = dataclasses.replace(usual.training, n_strategies=10, n_iterations=120, last_rate=1.0)
+        settings = dataclasses.replace(usual, training=training)
     moments = set(np.linspace(0, settings.training.n_iterations - 1, n_snapshots).astype(int).tolist())
-    states, returns = [], []
+    states, returns, every_step = [], [], []
     for record in progress(train_demonstrators(domain, domain.test_population, settings, seed)):
         if record["iteration"] in moments:
             data = rollout(domain, record["policies"].actor(), n_episodes, [seed, 9, record["iteration"]])
             states.append(data.observations[:, :, stride::stride].reshape(-1, domain.horizon // stride, domain.obs_dim).astype(np.float16))
             returns.append(data.returns.reshape(-1))
+            every_step.append(data.rewards_every_step.sum(-1).reshape(-1))
     policy = np.tile(np.repeat(np.arange(settings.training.n_strategies), n_episodes), len(states))
     snapshot = np.repeat(np.arange(len(states)), settings.training.n_strategies * n_episodes)
     metadata = {
@@ -206,6 +236,7 @@ def generate_test_set(
             f,
             observations=np.concatenate(states),
             returns=np.concatenate(returns).astype(np.float32),
+            returns_every_step=np.concatenate(every_step).astype(np.float32),
             policy=policy.astype(np.uint8),
             snapshot=snapshot.astype(np.uint8),
             metadata=np.array(json.dumps(metadata)),

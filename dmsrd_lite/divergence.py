@@ -25,24 +25,36 @@ def knn_divergence(expert: np.ndarray, rollout: np.ndarray, k: int = K_NEIGHBORS
     return float(d * np.mean(np.log(nu) - np.log(rho)) + np.log(len(rollout) / (n - 1)))
 
 
+def _compared(domain: Domain, trajectories: np.ndarray) -> np.ndarray:
+    return trajectories[:, 1:, list(domain.knn_coordinates)]
+
+
 def trajectory_divergences(domain: Domain, experts: np.ndarray, rollouts: np.ndarray) -> np.ndarray:
     """``D_KL`` of each expert trajectory (a, T, obs_dim) against each rollout (b, T, obs_dim): (a, b) nats.
 
     The protocol of every number in this workbook: k = 3, Chebyshev norm, raw units, initial states left out.
     """
-    a, t, d = experts[:, 1:].shape
-    states = experts[:, 1:].reshape(a * t, d)
-    rho = np.concatenate([_kth_distance(cKDTree(e[1:]), e[1:], K_NEIGHBORS + 1, domain.knn_resolution) for e in experts])
+    experts, rollouts = _compared(domain, experts), _compared(domain, rollouts)
+    a, t, d = experts.shape
+    rho = np.concatenate([_kth_distance(cKDTree(e), e, K_NEIGHBORS + 1, domain.knn_resolution) for e in experts])
     result = np.empty((a, len(rollouts)))
     for j, rollout in enumerate(rollouts):
-        nu = _kth_distance(cKDTree(rollout[1:]), states, K_NEIGHBORS, domain.knn_resolution)
-        result[:, j] = d * np.log(nu / rho).reshape(a, t).mean(1) + np.log((len(rollout) - 1) / (t - 1))
+        nu = _kth_distance(cKDTree(rollout), experts.reshape(a * t, d), K_NEIGHBORS, domain.knn_resolution)
+        result[:, j] = d * np.log(nu / rho).reshape(a, t).mean(1) + np.log(len(rollout) / (t - 1))
     return result
 
 
 def demonstration_divergence(domain: Domain, demonstration: np.ndarray, rollouts: np.ndarray) -> float:
-    """Mean of ``trajectory_divergences`` over all pairs: one demonstration (a, T, d) against rollouts (b, T, d), nats."""
-    return float(trajectory_divergences(domain, demonstration, rollouts).mean())
+    """One demonstration (a, T, obs_dim) against rollouts (b, T, obs_dim), nats.
+
+    The mean of ``trajectory_divergences`` over all pairs; in a domain with ``matched_starts`` instead all trajectories
+    pooled against as many rollouts pooled, the mean over such groups of rollouts.
+    """
+    if not domain.matched_starts:
+        return float(trajectory_divergences(domain, demonstration, rollouts).mean())
+    groups = np.array_split(_compared(domain, rollouts), max(1, len(rollouts) // len(demonstration)))
+    expert, *groups = (part.reshape(-1, part.shape[-1]) for part in (_compared(domain, demonstration), *groups))
+    return float(np.mean([knn_divergence(expert, group, resolution=domain.knn_resolution) for group in groups]))
 
 
 def own_divergence(domain: Domain, demonstration: np.ndarray) -> float:

@@ -28,7 +28,8 @@ class Domain:
 
     ``make_batch(n_environments, n_threads)`` returns an object with
     ``reset(seeds (n,)) -> observations (n, obs_dim)`` and
-    ``step(actions (n, action_dim)) -> observations (n, obs_dim), rewards (n,)``; actions must lie in the bounds.
+    ``step(actions (n, action_dim)) -> observations (n, obs_dim), rewards (n,), ended (n,)``; actions must lie in the bounds.
+    ``ended`` says that the task as others run it would be over; here it goes on.
     """
 
     name: str
@@ -44,8 +45,9 @@ class Domain:
     observation_scale: tuple[float, ...]  # ... and divided by this
     reward_text: str
     failure_text: str  # the word used in tables, e.g. "falls"
-    failed: Callable[[np.ndarray], np.ndarray]  # states (..., obs_dim) -> (...,) bool: has the task failed here?
+    failed: Callable[[np.ndarray, np.ndarray], np.ndarray]  # new states (..., obs_dim), rewards (...) -> bool (...): a failure?
     make_batch: Callable[[int, int], object]
+    in_processes: bool  # simulated in worker processes, because its simulator holds Python's lock
     draw_frame: Callable[[np.ndarray], np.ndarray]  # one observation -> (height, width, 3) uint8
     phase_axes: tuple[int, int]  # the two observations that show a strategy best
     reachable: tuple[float, ...]  # the simulator keeps |s| within this (inf: nothing does)
@@ -54,8 +56,11 @@ class Domain:
     demonstrators: tuple[Population, ...]  # the demonstrators are chosen from all of these ...
     test_population: Population  # ... and the test sets for rewards are made by this one
     success_return: float  # a demonstrator reaches at least this
+    knn_coordinates: tuple[int, ...]  # the coordinates of a state that the divergence compares
     knn_resolution: float  # distances below this are the noise of the recording (divergence)
+    matched_starts: bool  # starts differ more than strategies do: pool trajectories, compare rollouts from the same reset seeds
     kl_margin: float  # demonstrators of different strategies are at least this many nats apart ...
+    threshold_margin: float  # a mixture may be this many nats farther away than a good explanation (lifelong)
     kl_threshold: float  # ... and one demonstrator's own trajectories at most this many
 
     @property
@@ -66,10 +71,10 @@ class Domain:
     def action_dim(self) -> int:
         return len(self.action_names)
 
-    def first_failure(self, observations: np.ndarray) -> int:
-        """The step at which a trajectory (T, obs_dim) first fails; T when it never does."""
-        steps = np.flatnonzero(self.failed(observations))
-        return int(steps[0]) if len(steps) else len(observations)
+    def first_failure(self, states: np.ndarray, rewards: np.ndarray) -> int:
+        """The step at which a trajectory, new states (T, obs_dim) and rewards (T,), first fails; T when it never does."""
+        steps = np.flatnonzero(self.failed(states, rewards))
+        return int(steps[0]) if len(steps) else len(states)
 
     def network_input(self, observations: np.ndarray) -> np.ndarray:
         """What a network sees: ``clip(s, low, high) / scale`` as float32, same shape as ``observations``."""
@@ -110,9 +115,10 @@ class PendulumBatch:
         self._control[:] = actions
         self._batch.step(nstep=2)
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         self.simulate(actions)
-        return np.concatenate([self._position, self._velocity], axis=1), -np.abs(self._position[:, 1])
+        state = np.concatenate([self._position, self._velocity], axis=1)
+        return state, -np.abs(state[:, 1]), np.zeros(len(state), dtype=bool)
 
 
 def draw_pendulum(observation: np.ndarray, height: int = 120, width: int = 240) -> np.ndarray:
@@ -159,8 +165,9 @@ INVERTED_PENDULUM = Domain(
     observation_scale=(1.0, 1.0, 2.0, 4.0),
     reward_text="-|theta| of the new state, in rad, every step",
     failure_text="falls",
-    failed=lambda observations: np.abs(observations[..., 1]) > 1.0,
+    failed=lambda states, rewards: np.abs(states[..., 1]) > 1.0,
     make_batch=PendulumBatch,
+    in_processes=False,
     draw_frame=draw_pendulum,
     phase_axes=(0, 2),
     reachable=(1.0, float(np.pi / 2), np.inf, np.inf),
@@ -169,12 +176,100 @@ INVERTED_PENDULUM = Domain(
     demonstrators=(Population((0.1, 0.05), last_sigma=0.15), Population((0.4, 0.02), last_sigma=0.3)),  # by place; by movement
     test_population=Population((0.25, 0.03)),
     success_return=-60.0,
+    knn_coordinates=(0, 1, 2, 3),
     knn_resolution=1e-9,
+    matched_starts=False,
     kl_margin=3.0,
+    threshold_margin=0.5,
     kl_threshold=1.0,
 )
 
-DOMAINS = {domain.name: domain for domain in (INVERTED_PENDULUM,)}
+
+class LanderBatch:
+    """``n_environments`` of Gymnasium's continuous ``LunarLander-v3`` that go on after a crash or a landing.
+
+    One reset seed fixes terrain, first push and engine noise, as ``env.reset(seed=...)`` does there.
+    ``n_threads`` is ignored: Box2D steps one world after the other, and ``rollout`` shares the work among processes.
+    """
+
+    def __init__(self, n_environments: int, n_threads: int = 0):
+        from gymnasium.envs.box2d.lunar_lander import LunarLander
+
+        self._landers = [LunarLander(continuous=True) for _ in range(n_environments)]
+
+    def reset(self, seeds: np.ndarray) -> np.ndarray:
+        return np.array([lander.reset(seed=int(seed))[0] for lander, seed in zip(self._landers, seeds, strict=True)], dtype=np.float64)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        observations, rewards, ended, *_ = zip(*(e.step(a) for e, a in zip(self._landers, actions, strict=True)), strict=True)
+        return np.array(observations, dtype=np.float64), np.array(rewards, dtype=np.float64), np.array(ended)
+
+
+def draw_lander(observation: np.ndarray, height: int = 120, width: int = 150) -> np.ndarray:
+    """The lander drawn from the state; the terrain is not in it, so the ground is drawn at the pad's height: (height, width, 3)."""
+    from PIL import Image, ImageDraw
+
+    x, y, angle, legs = float(observation[0]), float(observation[1]), float(observation[4]), observation[6:8]
+    factor = 2  # drawn twice as large, then reduced: smooth edges
+    image = Image.new("RGB", (width * factor, height * factor), "#16213A")
+    draw = ImageDraw.Draw(image)
+    unit = width * factor / 20  # the scene is 20 x 13.3 metres of the simulator
+    ground = height * factor - 1.2 * unit
+    draw.rectangle([0, ground, width * factor, height * factor], fill="#BBBBBB")
+    draw.line([8 * unit, ground, 12 * unit, ground], fill="#E69F00", width=2 * factor)
+    centre = np.array([(10 + 10 * x) * unit, ground - (6.67 * y + 0.6) * unit])
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]) * unit * 1.6  # larger than true, to be seen
+
+    def place(*points):
+        return [tuple(centre + turn @ point) for point in np.array(points)]
+
+    for side, touches in zip((-1, 1), legs, strict=True):
+        draw.line(place((side * 0.35, 0.0), (side * 0.6, 0.6)), fill="#D55E00" if touches else "#56B4E9", width=2 * factor)
+    draw.polygon(place((-0.45, -0.3), (-0.3, -0.55), (0.3, -0.55), (0.45, -0.3), (0.4, 0.2), (-0.4, 0.2)), fill="#FFFFFF")
+    return np.asarray(image.resize((width, height), Image.LANCZOS))
+
+
+def lander_features(observations: np.ndarray) -> np.ndarray:
+    """What makes flights look different: where the lander is (half widths, half heights), and when (share of 500 steps)."""
+    place = np.clip(observations[..., 1:, :2], -1.0, 1.5)
+    time = np.broadcast_to(np.arange(1, place.shape[-2] + 1) / 500, place.shape[:-1])
+    return np.concatenate([place, time[..., None]], axis=-1)
+
+
+LUNAR_LANDER = Domain(
+    name="lunar_lander",
+    title="Lunar Lander",
+    horizon=500,
+    seconds_per_step=0.02,
+    observation_names=("x (half widths)", "y (half heights)", "vx", "vy", "angle (rad)", "angular velocity", "left leg", "right leg"),
+    action_names=("main engine", "side engines"),
+    action_low=(-1.0, -1.0),
+    action_high=(1.0, 1.0),
+    observation_low=(-2.5, -2.5, -10.0, -10.0, -6.2831855, -10.0, 0.0, 0.0),  # the observation space of Gymnasium
+    observation_high=(2.5, 2.5, 10.0, 10.0, 6.2831855, 10.0, 1.0, 1.0),
+    observation_scale=(0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 1.0, 1.0),
+    reward_text="Gymnasium's shaping and fuel, -100 for a crash or leaving the scene, +100 for coming to rest; nothing after that",
+    failure_text="crashes",
+    failed=lambda states, rewards: rewards == -100.0,  # what the simulator pays for it; no other step pays exactly this
+    make_batch=LanderBatch,
+    in_processes=True,
+    draw_frame=draw_lander,
+    phase_axes=(0, 1),
+    reachable=(np.inf,) * 8,
+    reward_axes=(0, 1),
+    diversity_features=lander_features,
+    demonstrators=(Population((0.1, 0.2, 0.1), last_sigma=0.2),),
+    test_population=Population((0.1, 0.2, 0.1)),
+    success_return=100.0,
+    knn_coordinates=(0, 1, 2, 3, 4, 5),  # not the legs' contacts: they are 0 or 1
+    knn_resolution=0.01,
+    matched_starts=True,
+    kl_margin=1.0,
+    threshold_margin=1.0,
+    kl_threshold=1.0,
+)
+
+DOMAINS = {domain.name: domain for domain in (INVERTED_PENDULUM, LUNAR_LANDER)}
 
 
 def get_domain(name: str) -> Domain:

@@ -22,8 +22,8 @@ from dmsrd_lite.networks import GaussianPolicies, under
 
 @dataclass(frozen=True)
 class LifelongSettings:
-    kl_threshold: float = 0.0  # eps: accept a mixture at or below this divergence (nats); 0: a demonstration's own + kl_margin
-    kl_margin: float = 0.5  # nats above the divergence of a demonstration's trajectories from each other
+    kl_threshold: float = 0.0  # eps: accept a mixture at or below this divergence (nats); 0: a reference + kl_margin
+    kl_margin: float = 0.0  # nats above the reference (``DMSRD._reference``); 0: the domain's ``threshold_margin``
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
     between_class: bool = True
     airl: AIRLSettings = AIRLSettings(n_iterations=12)
@@ -119,15 +119,17 @@ class DMSRD:
         s, old, started = self.settings, self.state, time.perf_counter()
         n, m = len(old.weights), old.n_strategies
         seed, steps = [old.seed, 102, n], {"search": 0, "airl": 0, "msrd": 0}
-        own = own_divergence(self.domain, new.observations[0])
-        threshold = s.kl_threshold or (own if np.isfinite(own) else self.domain.kl_threshold) + s.kl_margin
+        learner = self._new_learner(new, [*seed, 2]) if self.domain.matched_starts else None
+        reference = self._reference(new, learner, [*seed, 7])
+        threshold = s.kl_threshold or reference + (s.kl_margin or self.domain.threshold_margin)
         kl_mix = kl_new = float("inf")
         if m:
             fit = search_mixture(self.policies().actor(), new, s.mixture, [*seed, 1], n_threads=self.n_threads)
             kl_mix, weights, steps["search"] = fit.divergence, fit.weights, fit.steps
         networks, pure, branch = old.networks, old.pure, "mixture"
         if kl_mix > threshold:
-            learner, kl_new = self._new_strategy(new, [*seed, 2])
+            learner = learner or self._new_learner(new, [*seed, 2])
+            kl_new = self._train(learner, new, [*seed, 2])
             steps["airl"] = learner.steps
             branch = "mixture, better than a new strategy"
             if not kl_mix < kl_new:
@@ -154,7 +156,7 @@ class DMSRD:
             "branch": branch,
             "kl_mix": kl_mix,
             "kl_new": kl_new,
-            "own_divergence": own,
+            "reference": reference,
             "threshold": threshold,
             "weights": weights,
             "n_strategies": len(pure),
@@ -167,16 +169,31 @@ class DMSRD:
         }
         return replace(state, records=(*old.records, plain(record)))
 
-    def _new_strategy(self, new: DemonstrationSet, seed) -> tuple[AIRL, float]:
-        """AIRL on the new demonstration alone, and the KL of its policy."""
+    def _reference(self, new: DemonstrationSet, learner: AIRL | None, seed) -> float:
+        """How near a good explanation comes to a demonstration, without labels, in nats.
+
+        The divergence of the demonstration's trajectories from each other; the domain's own guess for a single one. With
+        ``matched_starts``, where these differ as much as strategies do, that of its clone's rollouts from the same starts.
+        """
+        if learner is None:
+            own = own_divergence(self.domain, new.observations[0])
+            return own if np.isfinite(own) else self.domain.kl_threshold
+        clone = learner.clone or AIRL(new, replace(self.settings.airl, warm_start=True), seed).clone
+        return float(policy_divergences(clone, new, seed, n_threads=self.n_threads)[0])
+
+    def _new_learner(self, new: DemonstrationSet, seed) -> AIRL:
+        """AIRL on the new demonstration alone, cloned and not yet trained."""
         s = self.settings
         shared = Rewards(self.domain, 1, s.airl.discount, seed, s.msrd.alpha)  # its task reward is zero
         if self.state.networks and s.add_task_reward:
             shared = self.rewards()
-        learner = AIRL(new, s.airl, seed, self.n_threads, shared=shared)
+        return AIRL(new, s.airl, seed, self.n_threads, shared=shared)
+
+    def _train(self, learner: AIRL, new: DemonstrationSet, seed) -> float:
+        """Train it, and the KL of its policy."""
         for _ in learner.train():
             pass
-        return learner, float(policy_divergences(learner.policies.actor(), new, [*seed, 9], n_threads=self.n_threads)[0])
+        return float(policy_divergences(learner.policies.actor(), new, [*seed, 9], n_threads=self.n_threads)[0])
 
     def _with_strategy(self, new: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         old = self.state.networks

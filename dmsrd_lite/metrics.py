@@ -1,5 +1,7 @@
 """The metrics of every table: one function scores every method in the same way."""
 
+import warnings
+
 import numpy as np
 
 from dmsrd_lite.demonstrations import DemonstrationSet, RewardTestSet
@@ -31,9 +33,21 @@ def divergence_floor(demonstrations: DemonstrationSet, second_take: Demonstratio
 
 
 def policy_divergences(actor, demonstrations: DemonstrationSet, seed, *, n_rollouts: int = 10, n_threads: int = 0) -> np.ndarray:
-    """KL of demonstration j, or of the only one, against fresh rollouts of policy j: (n_strategies,) nats."""
-    domain, shown = demonstrations.domain, demonstrations.observations
-    data = rollout(domain, actor, n_rollouts, seed, horizon=demonstrations.horizon, n_threads=n_threads)
+    """KL of demonstration j, or of the only one, against fresh rollouts of policy j: (n_strategies,) nats.
+
+    In a domain with ``matched_starts`` the rollouts start as the demonstration did, ``n_rollouts / k`` times (rounded,
+    at least once) from each of its k starts; where the demonstrations hold no reset seeds, from as many random starts.
+    """
+    domain, shown, starts = demonstrations.domain, demonstrations.observations, None
+    if domain.matched_starts:
+        repeats = max(1, round(n_rollouts / shown.shape[1]))
+        n_rollouts = repeats * shown.shape[1]
+        if demonstrations.reset_seeds is None:
+            text = f"the demonstrations hold no reset_seeds: {domain.name} rolls out from other starts, which adds to the KL"
+            warnings.warn(text, stacklevel=2)
+        else:
+            starts = np.tile(np.broadcast_to(demonstrations.reset_seeds, (actor.n_strategies, shown.shape[1])), repeats)
+    data = rollout(domain, actor, n_rollouts, seed, reset_seeds=starts, horizon=demonstrations.horizon, n_threads=n_threads)
     pairs = zip(np.broadcast_to(shown, (actor.n_strategies, *shown.shape[1:])), data.observations, strict=True)
     return np.array([demonstration_divergence(domain, d, r) for d, r in pairs])
 
@@ -44,16 +58,21 @@ def score_policies(
     """Score policy j against demonstration j by stochastic rollouts; each value is (n,).
 
     environment_return: mean undiscounted return. failure_share: share of rollouts that fail. divergence: KL in nats,
-    every trajectory of the demonstration against each of the first ``n_compared`` rollouts. log_likelihood_per_step:
-    nats per step of the demonstration.
+    against ``n_compared`` of these rollouts, or of others from the demonstration's starts (``policy_divergences``).
+    log_likelihood_per_step: nats per step of the demonstration.
     """
     domain = demonstrations.domain
     data = rollout(domain, actor, n_rollouts, seed, horizon=demonstrations.horizon, n_threads=n_threads)
-    pairs = zip(demonstrations.observations, data.observations[:, :n_compared], strict=True)
+    if domain.matched_starts:
+        seeds = [*np.atleast_1d(seed).tolist(), 1]
+        divergences = policy_divergences(actor, demonstrations, seeds, n_rollouts=n_compared, n_threads=n_threads)
+    else:
+        pairs = zip(demonstrations.observations, data.observations[:, :n_compared], strict=True)
+        divergences = np.array([demonstration_divergence(domain, d, r) for d, r in pairs])
     return {
         "environment_return": data.returns.mean(1),
-        "failure_share": domain.failed(data.observations).any(-1).mean(1),
-        "divergence": np.array([demonstration_divergence(domain, d, r) for d, r in pairs]),
+        "failure_share": data.failed.any(-1).mean(1),
+        "divergence": divergences,
         "log_likelihood_per_step": demonstration_log_likelihood(actor, demonstrations) / demonstrations.horizon,
     }
 

@@ -6,7 +6,7 @@ TRPO's conjugate gradient and line search would have to run for each strategy ap
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -119,13 +119,21 @@ class TrainingSettings:
     first_horizon: int = 100  # steps; grows to the domain's horizon between the shares ``hold`` and ``growing`` of the iterations
     hold: float = 0.0
     growing: float = 0.6
+    first_sigma: float = 0.2  # share of half the action range
     last_sigma: float = 0.0  # sigma shrinks to this (action units) between 0.4 and 0.9 of the iterations; 0: left to the optimiser
     last_rate: float = 1.0  # the learning rate falls linearly to this share of itself
+    last_discount: float = 0.0  # the discount grows to this, its distance from 1 by equal factors; 0: it stays
     ppo: PPOSettings = PPOSettings()
 
 
 def anneal(policies: GaussianPolicies, optimizer: PolicyOptimizer, settings: TrainingSettings, share: float) -> None:
-    """Lower the bound on sigma and the learning rate; with little noise left, what is rewarded is what a policy means to do."""
+    """Lower the bound on sigma and the learning rate, raise the discount.
+
+    With little noise left, what is rewarded is what a policy means to do; far sight is learned best from near sight.
+    """
+    if settings.last_discount:
+        far, near = 1 - settings.ppo.discount, 1 - settings.last_discount
+        optimizer.settings = replace(settings.ppo, discount=1 - far * (near / far) ** share)
     for group in optimizer.optimizer.param_groups:
         group["lr"] = settings.ppo.learning_rate * (1 - (1 - settings.last_rate) * share)
     if settings.last_sigma:
@@ -143,7 +151,7 @@ def train_policies(
     in all, and ``environment_return`` (M,) over ``horizon`` steps, which trains nothing unless ``reward`` is it.
     """
     s = settings
-    policies = GaussianPolicies(domain, s.n_strategies, [seed, 0])
+    policies = GaussianPolicies(domain, s.n_strategies, [seed, 0], s.first_sigma)
     optimizer = PolicyOptimizer(policies, s.ppo, [seed, 1])
     steps = 0
     for iteration in range(s.n_iterations):

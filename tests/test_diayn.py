@@ -55,7 +55,7 @@ def test_what_looks_different_is_place_and_movement(domain):
 
 def test_generation_writes_valid_files_and_records_the_choice(domain, tmp_path, monkeypatch):
     easy = dataclasses.replace(
-        domain, success_return=-1e9, failed=lambda s: np.zeros(s.shape[:-1], bool), horizon=60, kl_threshold=1e9, kl_margin=-1e9
+        domain, success_return=-1e9, failed=lambda s, r: np.zeros(r.shape, bool), horizon=60, kl_threshold=1e9, kl_margin=-1e9
     )
     monkeypatch.setitem(DOMAINS, domain.name, easy)
     choice = generate_demonstrations(easy, 0, tmp_path, settings=TINY, n_kept=2)

@@ -20,7 +20,7 @@ SHORT = {"n_iterations": 1, "episodes": 1, "cloning_steps": 150, "coverage_episo
 TINY = LifelongSettings(kl_threshold=1e-3, airl=AIRLSettings(**SHORT), msrd=MSRDSettings(**SHORT, between_class_batch=16),
                         mixture=MixtureSettings(4, 2, search_rollouts=1, n_finalists=2, final_rollouts=2))  # fmt: skip
 GENEROUS = dataclasses.replace(TINY, kl_threshold=1e9)  # every mixture will do
-FIELDS = {"demonstration", "branch", "kl_mix", "kl_new", "own_divergence", "threshold", "weights", "n_strategies", "steps",
+FIELDS = {"demonstration", "branch", "kl_mix", "kl_new", "reference", "threshold", "weights", "n_strategies", "steps",
           "kl_before_round", "kl_after_round", "searched_again", "recognized", "seconds"}  # fmt: skip
 
 
@@ -65,11 +65,11 @@ def assert_same(a, b):
 
 def answer_with(monkeypatch, *, kl_mix=None, kl_new=None):
     """Let the search or the new strategy come out with a given divergence."""
-    search, train = lifelong.search_mixture, DMSRD._new_strategy
+    search, train = lifelong.search_mixture, DMSRD._train
     if kl_mix is not None:
         monkeypatch.setattr(lifelong, "search_mixture", lambda *a, **k: dataclasses.replace(search(*a, **k), divergence=kl_mix))
     if kl_new is not None:
-        monkeypatch.setattr(DMSRD, "_new_strategy", lambda self, *a: (train(self, *a)[0], kl_new))
+        monkeypatch.setattr(DMSRD, "_train", lambda self, *a: (train(self, *a), kl_new)[1])
 
 
 def forbid(monkeypatch, *names):
@@ -341,11 +341,11 @@ def test_the_threshold_is_calibrated_by_the_demonstration_itself(three, domain):
     own = (knn_divergence(a, b) + knn_divergence(b, a)) / 2
     calibrated = dataclasses.replace(TINY, kl_threshold=0.0, kl_margin=0.75)
     (record,) = after(LifelongState(domain, 0), three.select([0]), calibrated).records
-    assert record["own_divergence"] == pytest.approx(own)
+    assert record["reference"] == pytest.approx(own)
     assert record["threshold"] == pytest.approx(own + 0.75)
     single = {name: array[:, :1] for name, array in three.select([0]).arrays().items() if name != "strategy_labels"}
     (record,) = after(LifelongState(domain, 0), dataclasses.replace(three, strategy_labels=None, **single), calibrated).records
-    assert record["own_divergence"] is None
+    assert record["reference"] == domain.kl_threshold
     assert record["threshold"] == domain.kl_threshold + 0.75
 
 
