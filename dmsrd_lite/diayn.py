@@ -21,7 +21,7 @@ from dmsrd_lite.divergence import divergence_table, own_divergence
 from dmsrd_lite.envs import Domain, InputError, Population
 from dmsrd_lite.metrics import policy_divergences
 from dmsrd_lite.networks import Actor, BatchedMLP, to_tensor
-from dmsrd_lite.policy_optimization import PPOSettings, TrainingSettings, train_policies
+from dmsrd_lite.policy_optimization import TRAINING, TrainingSettings, train_policies
 from dmsrd_lite.rollouts import Rollouts, draw_reset_seeds, rollout
 
 TEST_SEED, DEVELOPMENT_SEED, POPULATION_SEED = 1000, 2000, 3000  # added to a generation's seed: the trainings share nothing
@@ -37,9 +37,8 @@ class DiaynSettings:
     acting_noise: float = 0.8  # demonstrators act with this share of the sigma they were trained with
 
 
-_FLIGHT = TrainingSettings(n_strategies=20, n_iterations=240, episodes=6, first_horizon=500, first_sigma=0.6, last_rate=0.1,
-                           last_discount=0.998, ppo=PPOSettings(epochs=4, minibatch=500))  # fmt: skip
-SETTINGS = {"inverted_pendulum": DiaynSettings(), "lunar_lander": DiaynSettings(diversity_weight=0.03, training=_FLIGHT)}
+_FLIGHT = dataclasses.replace(TRAINING["lunar_lander"], n_strategies=20, n_iterations=240, last_rate=0.1)
+SETTINGS = {"inverted_pendulum": DiaynSettings(), "lunar_lander": DiaynSettings(diversity_weight=0.06, training=_FLIGHT)}
 
 
 class StrategyDiscriminator:

@@ -50,8 +50,8 @@ class Domain:
     in_processes: bool  # simulated in worker processes, because its simulator holds Python's lock
     draw_frame: Callable[[np.ndarray], np.ndarray]  # one observation -> (height, width, 3) uint8
     phase_axes: tuple[int, int]  # the two observations that show a strategy best
-    reachable: tuple[float, ...]  # the simulator keeps |s| within this (inf: nothing does)
-    reward_axes: tuple[int, int]  # the two observations over which a reward is drawn
+    reward_axes: tuple[int, int]  # the two observations over which a reward is drawn ...
+    reward_window: tuple[tuple[float, float], tuple[float, float]]  # ... within these bounds
     diversity_features: Callable[[np.ndarray], np.ndarray]  # (..., T+1, obs_dim) -> (..., T, n): what people would see
     demonstrators: tuple[Population, ...]  # the demonstrators are chosen from all of these ...
     test_population: Population  # ... and the test sets for rewards are made by this one
@@ -170,8 +170,8 @@ INVERTED_PENDULUM = Domain(
     in_processes=False,
     draw_frame=draw_pendulum,
     phase_axes=(0, 2),
-    reachable=(1.0, float(np.pi / 2), np.inf, np.inf),
     reward_axes=(1, 0),
+    reward_window=((-1.6, 1.6), (-1.0, 1.0)),
     diversity_features=pendulum_features,
     demonstrators=(Population((0.1, 0.05), last_sigma=0.15), Population((0.4, 0.02), last_sigma=0.3)),  # by place; by movement
     test_population=Population((0.25, 0.03)),
@@ -255,8 +255,8 @@ LUNAR_LANDER = Domain(
     in_processes=True,
     draw_frame=draw_lander,
     phase_axes=(0, 1),
-    reachable=(np.inf,) * 8,
     reward_axes=(0, 1),
+    reward_window=((-1.0, 1.0), (-0.2, 1.5)),
     diversity_features=lander_features,
     demonstrators=(Population((0.1, 0.2, 0.1), last_sigma=0.2),),
     test_population=Population((0.1, 0.2, 0.1)),

@@ -11,10 +11,10 @@ from dmsrd_lite.demonstrations import DemonstrationSet, RewardTestSet
 from dmsrd_lite.discrimination import recognized
 from dmsrd_lite.envs import InputError
 from dmsrd_lite.lifelong import DMSRD, LifelongSettings
-from dmsrd_lite.metrics import correlations_on, score_policies
+from dmsrd_lite.metrics import correlations_on, reward_correlation, score_policies
 from dmsrd_lite.mixture import Mixtures
 from dmsrd_lite.msrd import MSRD, MSRDSettings
-from dmsrd_lite.networks import GaussianPolicies, under
+from dmsrd_lite.networks import GaussianPolicies, to_tensor, under
 
 METHODS = ("cloning", "AIRL Single", "AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD")
 
@@ -120,3 +120,28 @@ def restore(tensors: dict[str, np.ndarray], shown: DemonstrationSet, alpha: floa
     known = any(k.startswith("reward.") for k in tensors)
     part = "task" if alpha else "g"
     return Learned(modules["policy"], tensors["weights"], modules["reward"] if known else None, part, tuple(pure))
+
+
+def fit_reward(known: RewardTestSet, seed, n_steps: int = 2000, batch: int = 128) -> Rewards:
+    """A state reward, the same network as a learned one, fitted to true returns: what any state reward could know.
+
+    Minimises ``(mean_t g(s_t) - standardised return)^2`` over trajectories; every fifth is held out, and the weights that
+    correlate best with these are kept. Its correlation on a test set is the ceiling of the task-reward correlation.
+    """
+    rng, rewards = np.random.default_rng(seed), Rewards(known.domain, 1, 0.99, [*np.atleast_1d(seed).tolist(), 1])
+    x = to_tensor(known.domain.network_input(known.observations))
+    target = to_tensor((known.returns - known.returns.mean()) / known.returns.std())
+    held = np.arange(len(target)) % 5 == 0
+    optimizer, best = torch.optim.Adam(rewards.strategy_reward.parameters(), lr=3e-3, fused=True), -1.0
+    for step in range(n_steps):
+        pick = rng.choice(np.flatnonzero(~held), batch)
+        loss = (rewards.g(x[pick].flatten(0, 1)[None]).view(batch, -1).mean(1) - target[pick]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if step % 50 == 49:
+            found = reward_correlation(rewards.evaluate(known.observations[held])[0].mean(1), known.returns[held])
+            if found > best:
+                best, kept = found, {k: v.clone() for k, v in rewards.state_dict().items()}
+    rewards.load_state_dict(kept)
+    return rewards

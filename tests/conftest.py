@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from dmsrd_lite.demonstrations import DemonstrationSet
-from dmsrd_lite.envs import INVERTED_PENDULUM
+from dmsrd_lite.envs import INVERTED_PENDULUM, LUNAR_LANDER
 from dmsrd_lite.networks import GaussianPolicies
 from dmsrd_lite.rollouts import rollout
 
@@ -15,10 +15,19 @@ def domain():
     return INVERTED_PENDULUM
 
 
-@pytest.fixture
-def small_set(domain):
+def untrained_set(domain):
     """Two demonstrations of two trajectories and 50 steps, by untrained policies."""
     actor = GaussianPolicies(domain, 2, 0).actor()
     data = rollout(domain, actor, 2, 0, horizon=50)
     likelihoods = np.zeros((2, 2))
     return DemonstrationSet(domain, data.observations, data.executed_actions, data.rewards, np.arange(2), data.reset_seeds, likelihoods)
+
+
+@pytest.fixture
+def small_set(domain):
+    return untrained_set(domain)
+
+
+@pytest.fixture
+def lander_set():
+    return untrained_set(LUNAR_LANDER)

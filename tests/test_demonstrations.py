@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from dmsrd_lite.__main__ import main
+from dmsrd_lite.airl import AIRL, AIRLSettings
 from dmsrd_lite.demonstrations import load_demonstrations, load_shipped, load_test_set, save_demonstrations, validate_file
 from dmsrd_lite.divergence import divergence_table
-from dmsrd_lite.envs import InputError
+from dmsrd_lite.envs import LUNAR_LANDER, InputError
 
 
 def arrays_of(demonstrations):
@@ -273,3 +274,17 @@ def test_shipped_sets(domain):
     assert test.returns.max() > -20
     sampled = -np.abs(test.observations[:, :, 1]).mean(1) * domain.horizon
     assert np.corrcoef(sampled, test.returns)[0, 1] > 0.99, "every tenth state must tell the whole trajectory's return"
+
+
+def test_a_lander_file_made_elsewhere(tmp_path):
+    """Only T states for each trajectory, actions in [-1, 1], nothing else: 1500 = 3 x 500 states."""
+    rng = np.random.default_rng(0)
+    metadata = json.dumps({"domain": "lunar_lander", "schema_version": 1})
+    states, actions = rng.normal(size=(2, 3, 500, 8)) / 5, rng.uniform(-1, 1, (2, 3, 500, 2))
+    np.savez(tmp_path / "theirs.npz", observations=states, actions=actions, metadata=np.array(metadata))
+    shown = load_demonstrations(tmp_path / "theirs.npz", LUNAR_LANDER)
+    assert shown.horizon == 500
+    assert [part.shape[1] for part in shown.transitions()] == [3 * 499] * 3
+    settings = AIRLSettings(n_iterations=1, episodes=1, cloning_steps=5, coverage_episodes=1, discriminator_steps=1)
+    *_, record = AIRL(shown, settings, 0).train()
+    assert np.isfinite(record["discriminator_loss"]).all()

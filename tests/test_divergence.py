@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from dmsrd_lite.divergence import demonstration_divergence, divergence_table, knn_divergence, own_divergence, trajectory_divergences
+from dmsrd_lite.envs import LUNAR_LANDER
 
 
 def gaussian_kl(shift, width, d):
@@ -60,3 +61,14 @@ def test_tables_are_made_of_the_single_estimate(domain):
     assert table[0, 1] == pytest.approx(pairs.mean())
     own = trajectory_divergences(domain, sets[0], sets[0])
     assert table[0, 0] == own_divergence(domain, sets[0]) == pytest.approx((own.sum() - np.trace(own)) / 6)
+
+
+def test_with_matched_starts_trajectories_are_pooled():
+    rng = np.random.default_rng(0)
+    shown, flown = rng.normal(size=(3, 41, 8)), rng.normal(0.3, size=(6, 41, 8))
+    shown[..., 6:] = flown[..., 6:] = 0.0
+    flown[3:, :, 6:] = 100.0  # the legs' contacts must not count
+    pooled, first, second = (part[:, 1:, :6].reshape(-1, 6) for part in (shown, flown[:3], flown[3:]))
+    by_hand = (knn_divergence(pooled, first, resolution=0.01) + knn_divergence(pooled, second, resolution=0.01)) / 2
+    assert demonstration_divergence(LUNAR_LANDER, shown, flown) == pytest.approx(by_hand)
+    assert demonstration_divergence(LUNAR_LANDER, shown, flown[:3]) == pytest.approx(knn_divergence(pooled, first, resolution=0.01))

@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -99,7 +100,7 @@ def test_the_return_is_paid_once(wrecks):
     for m, e in ((0, 0), (3, 2)):
         env.reset(seed=int(wrecks.reset_seeds[m, e]))
         once, every_step, crashes, over = 0.0, 0.0, [], False
-        for t, action in enumerate(wrecks.executed_actions[m, e]):
+        for action in wrecks.executed_actions[m, e]:
             _, reward, ended, *_ = env.step(action)
             once += 0.0 if over else reward
             crashes.append(reward == -100 and not over)
@@ -145,9 +146,13 @@ def test_workers_are_kept_and_a_dead_one_is_reported():
     before = rollout(LUNAR_LANDER, actor, 2, 0, horizon=20, n_threads=2)
     assert workers() == first, "the same processes must serve the next call"
     os.kill(min(first), signal.SIGKILL)
-    with pytest.raises(RuntimeError, match="^a simulator process ended before its rollouts were done; expected it to live"):
+
+    def until_noticed():
         for _ in range(100):  # the death may be noticed a moment later
             rollout(LUNAR_LANDER, actor, 2, 0, horizon=20, n_threads=2)
+
+    with pytest.raises(RuntimeError, match=r"^a simulator process ended before its rollouts were done; expected it to live"):
+        until_noticed()
     after = rollout(LUNAR_LANDER, actor, 2, 0, horizon=20, n_threads=2)
     assert workers().isdisjoint(first)
     assert np.array_equal(before.observations, after.observations)
@@ -173,7 +178,8 @@ def test_workers_end_with_the_program(end, tmp_path):
     processes = [int(p) for p in done.stdout.split()]
     assert len(processes) == 2, done.stderr
     for _ in range(100):
-        alive = [p for p in processes if os.path.exists(f"/proc/{p}") and " Z " not in open(f"/proc/{p}/stat").read()]
+        stats = [Path(f"/proc/{p}/stat") for p in processes]
+        alive = [path for path in stats if path.exists() and " Z " not in path.read_text()]
         if not alive:
             break
         time.sleep(0.1)

@@ -9,7 +9,7 @@ from test_mixture import balancers, shown_by
 from dmsrd_lite import airl, lifelong, metrics
 from dmsrd_lite.airl import AIRLSettings
 from dmsrd_lite.divergence import knn_divergence
-from dmsrd_lite.envs import INVERTED_PENDULUM, InputError
+from dmsrd_lite.envs import INVERTED_PENDULUM, LUNAR_LANDER, InputError
 from dmsrd_lite.lifelong import DMSRD, LifelongSettings, LifelongState, load_state, save_state
 from dmsrd_lite.mixture import MixtureSettings
 from dmsrd_lite.msrd import MSRDSettings
@@ -499,3 +499,18 @@ def test_saving_replaces_the_whole_file_or_nothing(states, tmp_path, monkeypatch
     with pytest.raises(InputError, match="cannot be written to"):
         save_state(tmp_path / "FILE" / "a.safetensors", states[1])
     assert {p.name for p in tmp_path.iterdir()} == {"a.safetensors", "FILE"}
+
+
+@pytest.mark.parametrize("warm_start", [True, False])
+def test_on_the_lander_the_clone_calibrates_the_threshold(lander_set, warm_start, monkeypatch):
+    made, first = [], lander_set.select([0])
+    watch(monkeypatch, "AIRL", made)
+    off = {"warm_start": warm_start, "coverage": warm_start}
+    settings = dataclasses.replace(TINY, kl_threshold=0.0, airl=dataclasses.replace(TINY.airl, **off),
+                                   msrd=dataclasses.replace(TINY.msrd, **off))  # fmt: skip
+    learner = DMSRD(LUNAR_LANDER, settings, 0)
+    (record,) = learner.learn(first)
+    clone = made[-1]["learner"].clone
+    assert len(made) == (1 if warm_start else 2), "the clone that AIRL starts from is the one that calibrates"
+    assert record["reference"] == metrics.policy_divergences(clone, first, [0, 102, 0, 7])[0]
+    assert record["threshold"] == record["reference"] + LUNAR_LANDER.threshold_margin

@@ -10,7 +10,7 @@ from dmsrd_lite.airl import AIRLSettings
 from dmsrd_lite.demonstrations import RewardTestSet
 from dmsrd_lite.envs import InputError
 from dmsrd_lite.lifelong import LifelongSettings
-from dmsrd_lite.metrics import reward_correlation
+from dmsrd_lite.metrics import correlations_on, reward_correlation
 from dmsrd_lite.mixture import MixtureSettings
 from dmsrd_lite.msrd import MSRDSettings
 from dmsrd_lite.policy_optimization import PPOSettings
@@ -22,16 +22,23 @@ LOOP = LifelongSettings(airl=AIRLSettings(**SMALL), msrd=MSRDSettings(**SMALL, b
 TINY = methods.MethodSettings(AIRLSettings(**SMALL), MSRDSettings(**SMALL), LOOP)
 
 
+def make_truth(domain, n=30):
+    rng = np.random.default_rng(0)
+    states = rng.normal(size=(n, 5, domain.obs_dim)) * rng.uniform(0, 1, (n, 1, 1))
+    return RewardTestSet(domain, states.astype(np.float32), -np.abs(states[..., 1]).sum(1), np.zeros(n), np.zeros(n), {})
+
+
 @pytest.fixture
 def truth(domain):
-    rng = np.random.default_rng(0)
-    states = rng.normal(size=(30, 5, 4)) * rng.uniform(0, 1, (30, 1, 1))
-    return RewardTestSet(domain, states.astype(np.float32), -np.abs(states[..., 1]).sum(1), np.zeros(30), np.zeros(30), {})
+    return make_truth(domain)
 
 
 @pytest.mark.parametrize("variant", ["ours", "paper"])
 @pytest.mark.parametrize("method", methods.METHODS)
-def test_what_is_stored_scores_the_same(method, variant, small_set, truth):
+@pytest.mark.parametrize("task", ["inverted_pendulum", "lunar_lander"])
+def test_what_is_stored_scores_the_same(task, method, variant, small_set, lander_set):
+    small_set = {"inverted_pendulum": small_set, "lunar_lander": lander_set}[task]
+    truth = make_truth(small_set.domain)
     if (method, variant) == ("cloning", "paper"):
         pytest.skip("cloning has nothing to switch off")
     settings = TINY if variant == "ours" else TINY.as_in_the_paper()
@@ -69,3 +76,11 @@ def test_as_in_the_paper_switches_three_things_off_everywhere():
 def test_unknown_method(small_set):
     with pytest.raises(InputError, match="unknown method 'GAIL': expected one of cloning, AIRL Single"):
         methods.train_method("GAIL", small_set, TINY, 0)
+
+
+def test_the_ceiling_is_what_a_state_reward_can_know(domain):
+    known, test = make_truth(domain, 600), make_truth(domain, 600)
+    held = dataclasses.replace(test, observations=test.observations[::-1], returns=test.returns[::-1])
+    assert correlations_on(held, methods.fit_reward(known, 0, 500))[0] > 0.95, "the return is a function of the states"
+    noise = dataclasses.replace(known, returns=np.random.default_rng(1).normal(size=600))
+    assert abs(correlations_on(held, methods.fit_reward(noise, 0, 100))[0]) < 0.6, "nothing can be known about noise"

@@ -1,9 +1,13 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.stats import norm, pearsonr
 
+from dmsrd_lite import metrics
 from dmsrd_lite.demonstrations import RewardTestSet, demonstrations_from
 from dmsrd_lite.divergence import demonstration_divergence, own_divergence
+from dmsrd_lite.envs import LUNAR_LANDER
 from dmsrd_lite.metrics import (
     correlations_on,
     demonstration_log_likelihood,
@@ -93,3 +97,33 @@ def test_correlation_is_pearsons(domain):
             return np.stack([-np.abs(observations[..., 1]), np.abs(observations[..., 1])])
 
     assert correlations_on(test, Truth()) == pytest.approx([1.0, -1.0])
+
+
+def test_lander_rollouts_start_as_the_demonstration_did(lander_set, monkeypatch):
+    seen = []
+
+    def watched(*arguments, **keywords):
+        seen.append(rollout(*arguments, **keywords))
+        return seen[-1]
+
+    monkeypatch.setattr(metrics, "rollout", watched)
+    actor = GaussianPolicies(LUNAR_LANDER, 2, 3).actor()
+    divergences = policy_divergences(actor, lander_set, 0, n_rollouts=5)
+    (data,) = seen
+    assert data.reset_seeds.tolist() == np.tile(lander_set.reset_seeds, 2).tolist(), "5 rollouts of 2 starts: twice from each"
+    assert np.array_equal(data.observations[:, :2, 0], lander_set.observations[:, :, 0])
+    for j in (0, 1):
+        assert divergences[j] == demonstration_divergence(LUNAR_LANDER, lander_set.observations[j], data.observations[j])
+    policy_divergences(actor, lander_set.select([1]), 0, n_rollouts=1)
+    assert seen[1].reset_seeds.tolist() == [lander_set.reset_seeds[1].tolist()] * 2, "one demonstration, two policies"
+    with pytest.warns(UserWarning, match="hold no reset_seeds"):
+        policy_divergences(actor, dataclasses.replace(lander_set, reset_seeds=None), 0)
+
+
+def test_lander_scores_use_matched_starts_for_the_divergence_only(lander_set):
+    actor = GaussianPolicies(LUNAR_LANDER, 2, 3).actor()
+    scores = score_policies(actor, lander_set, 5, n_rollouts=4, n_compared=2)
+    assert np.array_equal(scores["divergence"], policy_divergences(actor, lander_set, [5, 1], n_rollouts=2))
+    free = rollout(LUNAR_LANDER, actor, 4, 5, horizon=50)
+    assert np.array_equal(scores["environment_return"], free.returns.mean(1))
+    assert np.array_equal(scores["failure_share"], free.failed.any(-1).mean(1))
