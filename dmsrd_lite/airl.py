@@ -31,8 +31,8 @@ class AIRLSettings:
     cloning_weight: float = 1.0  # weight of the demonstration's negative log-likelihood in the policy loss (the paper: 0)
     cloning_steps: int = 2000
     coverage: bool = True  # half of the discriminator's policy samples come from wide exploratory rollouts (the paper: off)
-    coverage_episodes: int = 2  # of the untrained policy and of the clone at each noise level
-    coverage_noise: tuple[float, ...] = (1.0, 3.0, 10.0)  # sigma of the clone times this
+    coverage_episodes: int = 2  # of the untrained policy and of the clone at each level
+    coverage_levels: tuple[tuple[float, float], ...] = ()  # as ``Domain.coverage``; (): the domain's
     discriminator_steps: int = 12
     discriminator_batch: int = 256  # demonstration samples per strategy and step, and as many others
     discriminator_rate: float = 3e-3
@@ -216,9 +216,10 @@ class AIRL:
         return (*(to_tensor(self.domain.network_input(s)) for s in (states, successors)), to_tensor(log_pi))
 
     def _explore(self) -> None:
-        """Coverage: rollouts of the untrained policy and of the clone at several noise levels, made once."""
-        s, everyone = self.settings, range(len(self.x))
-        levels = [self.untrained, *(self.clone.select(everyone, factor) for factor in s.coverage_noise)]
+        """Coverage: rollouts of the untrained policy and of the clone, made worse in several ways, made once."""
+        s, rng = self.settings, np.random.default_rng([*self.seed, 6])
+        levels = s.coverage_levels or self.domain.coverage
+        levels = [self.untrained, *(self.clone.disturbed(*level, rng) for level in levels)]
         actor = Actor.joined(levels)
         data = rollout(self.domain, actor, s.coverage_episodes, [*self.seed, 4], horizon=self.horizon, n_threads=self.n_threads)
         self.steps += data.n_steps // len(self.x)

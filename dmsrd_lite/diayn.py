@@ -35,10 +35,11 @@ class DiaynSettings:
     discriminator_rate: float = 1e-3
     training: TrainingSettings = TrainingSettings(n_strategies=20, n_iterations=160, episodes=4, last_rate=0.1)
     acting_noise: float = 0.8  # demonstrators act with this share of the sigma they were trained with
+    attempts: int = 1  # starts that are tried for each one that is shown: nobody shows an attempt that failed
 
 
 _FLIGHT = dataclasses.replace(TRAINING["lunar_lander"], n_strategies=20, n_iterations=240, last_rate=0.1)
-SETTINGS = {"inverted_pendulum": DiaynSettings(), "lunar_lander": DiaynSettings(diversity_weight=0.06, training=_FLIGHT)}
+SETTINGS = {"inverted_pendulum": DiaynSettings(), "lunar_lander": DiaynSettings(diversity_weight=0.06, training=_FLIGHT, attempts=4)}
 
 
 class StrategyDiscriminator:
@@ -143,9 +144,10 @@ def generate_demonstrations(
 ) -> dict:
     """Train demonstrators, keep the most distinct of the successful ones, write their demonstrations and a second take.
 
-    Success: every trajectory of both takes returns at least ``domain.success_return`` and none fails, and (without
-    ``matched_starts``) a demonstrator's own trajectories are within ``domain.kl_threshold`` of each other. Of the
-    successful ones those are kept that look most different, at least ``domain.kl_margin`` nats apart (``distances``).
+    A start is good if the trajectories of both takes return at least ``domain.success_return`` and do not fail. Success:
+    ``n_trajectories`` good starts, the first of which are shown, and (without ``matched_starts``) a demonstrator's own
+    trajectories within ``domain.kl_threshold`` of each other. Of the successful ones those are kept that look most
+    different (with ``matched_starts``: are most nats apart), at least ``domain.kl_margin`` nats apart (``distances``).
     Returns the choice as written into the files' metadata; ``InputError`` when too few are left (nothing is written then).
     """
     settings = settings or SETTINGS[domain.name]
@@ -157,17 +159,18 @@ def generate_demonstrations(
     actor = Actor.joined(actors)
     everyone = np.arange(actor.n_strategies)
     actor = actor.select(everyone, settings.acting_noise)
-    starts = draw_reset_seeds(np.random.default_rng([seed, 7]), len(everyone), n_trajectories)
-    shown = [rollout(domain, actor, n_trajectories, [seed, 8, number], reset_seeds=starts) for number in range(len(takes))]
-    fits = np.array([domain.matched_starts or own_divergence(domain, o) <= domain.kl_threshold for o in shown[0].observations])
-    for data in shown:
-        fits &= ~data.failed.any((1, 2)) & (data.returns >= domain.success_return).all(1)
+    starts = draw_reset_seeds(np.random.default_rng([seed, 7]), len(everyone), n_trajectories * settings.attempts)
+    tried = [rollout(domain, actor, starts.shape[1], [seed, 8, number], reset_seeds=starts) for number in range(len(takes))]
+    good = np.all([(data.returns >= domain.success_return) & ~data.failed.any(-1) for data in tried], axis=0)  # (m, starts)
+    fits, pick = good.sum(1) >= n_trajectories, np.argsort(~good, axis=1, kind="stable")[:, :n_trajectories]
+    shown = [demonstrations_from(data.select_episodes(pick), actor) for data in tried]
+    if not domain.matched_starts:
+        fits &= np.array([own_divergence(domain, o) <= domain.kl_threshold for o in shown[0].observations])
     kept, smallest = np.flatnonzero(fits), 0.0
-    first = demonstrations_from(shown[0], actor)
     if len(kept) >= n_kept:
-        table, own = distances(domain, first.select(kept), actor.select(kept), [seed, 10])
+        table, own = distances(domain, shown[0].select(kept), actor.select(kept), [seed, 10])
         nearness = table / domain.kl_margin - 1  # below 0: too near, and dropped first
-        look = visible_distance(domain, first.observations[kept])
+        look = table if domain.matched_starts else visible_distance(domain, shown[0].observations[kept])
         pick = most_distinct(np.where(np.minimum(nearness, nearness.T) < 0, nearness, look), n_kept)
         smallest = table[np.ix_(pick, pick)][~np.eye(n_kept, dtype=bool)].min()
         kept, own = kept[pick], own[pick].max()
@@ -178,6 +181,7 @@ def generate_demonstrations(
         )
     choice = {
         "trained": len(everyone),
+        "good_starts": good.mean(1),
         "successful": np.flatnonzero(fits),
         "kept": kept,
         "smallest_divergence": smallest,
@@ -186,9 +190,9 @@ def generate_demonstrations(
     choice = {name: np.round(value, 3).tolist() for name, value in choice.items()}
     metadata = {"seed": seed, "choice": choice, "settings": dataclasses.asdict(settings),
                 "made_by": f"python -m dmsrd_lite generate {domain.name} --seed {seed}"}  # fmt: skip
-    for (take, path), data in zip(takes.items(), shown, strict=True):
-        one = demonstrations_from(data, actor, {**metadata, "take": take}).select(kept)
-        save_demonstrations(path, dataclasses.replace(one, strategy_labels=np.arange(n_kept)))
+    for (take, path), everybody in zip(takes.items(), shown, strict=True):
+        some = dataclasses.replace(everybody.select(kept), strategy_labels=np.arange(n_kept), metadata={**metadata, "take": take})
+        save_demonstrations(path, some)
     return choice
 
 

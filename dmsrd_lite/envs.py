@@ -60,6 +60,7 @@ class Domain:
     knn_resolution: float  # distances below this are the noise of the recording (divergence)
     matched_starts: bool  # starts differ more than strategies do: pool trajectories, compare rollouts from the same reset seeds
     kl_margin: float  # demonstrators of different strategies are at least this many nats apart ...
+    coverage: tuple[tuple[float, float], ...]  # exploratory rollouts: clones disturbed so (``Actor.disturbed``: noise, drift)
     threshold_margin: float  # a mixture may be this many nats farther away than a good explanation (lifelong)
     kl_threshold: float  # ... and one demonstrator's own trajectories at most this many
 
@@ -180,6 +181,7 @@ INVERTED_PENDULUM = Domain(
     knn_resolution=1e-9,
     matched_starts=False,
     kl_margin=3.0,
+    coverage=((1.0, 0.0), (3.0, 0.0), (10.0, 0.0)),
     threshold_margin=0.5,
     kl_threshold=1.0,
 )
@@ -265,6 +267,7 @@ LUNAR_LANDER = Domain(
     knn_resolution=0.01,
     matched_starts=True,
     kl_margin=1.0,
+    coverage=((10.0, 0.0), (30.0, 0.0), (1.0, 2.0)),  # only such as fail: nearly good flights made the task reward worse
     threshold_margin=1.0,
     kl_threshold=1.0,
 )

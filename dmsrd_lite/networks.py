@@ -112,6 +112,13 @@ class Actor:
             self.domain, [w[pick] for w in self.weights], [b[pick] for b in self.biases], self.sigma[pick] * np.float32(sigma_factor)
         )
 
+    def disturbed(self, noise: float, drift: float, rng: np.random.Generator) -> "Actor":
+        """Worse policies: every sigma times ``noise``; a constant, ``drift * N(0, 1)`` half ranges, added to a policy's actions."""
+        half_range = (np.array(self.domain.action_high) - np.array(self.domain.action_low)) / 2
+        worse = self.select(range(self.n_strategies), noise)
+        moved = worse.biases[-1] + (drift * half_range * rng.standard_normal(worse.biases[-1].shape)).astype(np.float32)
+        return Actor(self.domain, worse.weights, [*worse.biases[:-1], moved], worse.sigma)
+
 
 def under(name: str, tensors: dict) -> dict:
     """The entries of ``tensors`` whose names start with ``name.``, without that prefix."""

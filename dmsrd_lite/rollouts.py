@@ -8,7 +8,7 @@ import threading
 import types
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 
 import cloudpickle
@@ -52,6 +52,11 @@ class Rollouts:
     @property
     def n_steps(self) -> int:
         return self.rewards.size
+
+    def select_episodes(self, indices: np.ndarray) -> "Rollouts":
+        """The episodes ``indices`` (M, k) of each policy, in that order."""
+        rows, arrays = np.arange(len(indices))[:, None], (getattr(self, f.name) for f in fields(self)[1:])
+        return Rollouts(self.domain, *(array[rows, indices] for array in arrays))
 
 
 def draw_reset_seeds(rng: np.random.Generator, *shape: int) -> np.ndarray:

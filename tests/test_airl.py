@@ -10,7 +10,8 @@ from dmsrd_lite.networks import to_tensor
 from dmsrd_lite.policy_optimization import PPOSettings
 from dmsrd_lite.rollouts import rollout
 
-TINY = AIRLSettings(n_iterations=2, episodes=1, cloning_steps=60, coverage_episodes=1, coverage_noise=(1.0, 3.0), discriminator_steps=2,
+TINY = AIRLSettings(n_iterations=2, episodes=1, cloning_steps=60, coverage_episodes=1, coverage_levels=((1, 0), (3, 0)),
+                    discriminator_steps=2,
                     discriminator_batch=16, replay_samples=30, ppo=PPOSettings(minibatch=25))  # fmt: skip
 
 

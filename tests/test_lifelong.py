@@ -15,7 +15,8 @@ from dmsrd_lite.mixture import MixtureSettings
 from dmsrd_lite.msrd import MSRDSettings
 from dmsrd_lite.policy_optimization import PPOSettings
 
-SHORT = {"n_iterations": 1, "episodes": 1, "cloning_steps": 150, "coverage_episodes": 1, "coverage_noise": (1.0, 3.0), "replay_samples": 30,
+SHORT = {"n_iterations": 1, "episodes": 1, "cloning_steps": 150, "coverage_episodes": 1, "coverage_levels": ((1, 0), (3, 0)),
+         "replay_samples": 30,
          "discriminator_steps": 2, "discriminator_batch": 16, "ppo": PPOSettings(minibatch=25)}  # fmt: skip
 TINY = LifelongSettings(kl_threshold=1e-3, airl=AIRLSettings(**SHORT), msrd=MSRDSettings(**SHORT, between_class_batch=16),
                         mixture=MixtureSettings(4, 2, search_rollouts=1, n_finalists=2, final_rollouts=2))  # fmt: skip

@@ -15,7 +15,8 @@ from dmsrd_lite.mixture import MixtureSettings
 from dmsrd_lite.msrd import MSRDSettings
 from dmsrd_lite.policy_optimization import PPOSettings
 
-SMALL = {"n_iterations": 1, "episodes": 1, "cloning_steps": 40, "coverage_episodes": 1, "coverage_noise": (3.0,), "discriminator_steps": 2,
+SMALL = {"n_iterations": 1, "episodes": 1, "cloning_steps": 40, "coverage_episodes": 1, "coverage_levels": ((3, 0),),
+         "discriminator_steps": 2,
          "discriminator_batch": 16, "replay_samples": 30, "ppo": PPOSettings(minibatch=25)}  # fmt: skip
 LOOP = LifelongSettings(airl=AIRLSettings(**SMALL), msrd=MSRDSettings(**SMALL, between_class_extra=1),
                         mixture=MixtureSettings(4, 2, search_rollouts=1, n_finalists=1, final_rollouts=1))  # fmt: skip

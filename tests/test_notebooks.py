@@ -19,6 +19,13 @@ def test_lesson_runs_quick(path, tmp_path):
     assert "does not hold" not in text
 
 
+@pytest.mark.parametrize("path", lessons(), ids=lambda p: p.stem)
+def test_lesson_runs_quick_on_the_lander(path, tmp_path):
+    error, _ = execute(path, tmp_path / path.name, {"preset": "quick", "domain": "lunar_lander"})
+    assert error == ""
+    assert handed_over(nbformat.read(tmp_path / path.name, 4))["seconds"] > 0
+
+
 def test_lesson_runs_from_its_own_folder(tmp_path):
     error, _ = execute(NOTEBOOKS / "00_start_here.ipynb", tmp_path / "out.ipynb", {"preset": "quick"}, folder=NOTEBOOKS)
     assert error == ""
