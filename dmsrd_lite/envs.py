@@ -61,7 +61,6 @@ class Domain:
     matched_starts: bool  # starts differ more than strategies do: pool trajectories, compare rollouts from the same reset seeds
     kl_margin: float  # demonstrators of different strategies are at least this many nats apart ...
     coverage: tuple[tuple[float, float], ...]  # exploratory rollouts: clones disturbed so (``Actor.disturbed``: noise, drift)
-    threshold_margin: float  # a mixture may be this many nats farther away than a good explanation (lifelong)
     kl_threshold: float  # ... and one demonstrator's own trajectories at most this many
 
     @property
@@ -182,7 +181,6 @@ INVERTED_PENDULUM = Domain(
     matched_starts=False,
     kl_margin=3.0,
     coverage=((1.0, 0.0), (3.0, 0.0), (10.0, 0.0)),
-    threshold_margin=0.5,
     kl_threshold=1.0,
 )
 
@@ -268,7 +266,6 @@ LUNAR_LANDER = Domain(
     matched_starts=True,
     kl_margin=1.0,
     coverage=((10.0, 0.0), (30.0, 0.0), (1.0, 2.0)),  # only such as fail: nearly good flights made the task reward worse
-    threshold_margin=1.0,
     kl_threshold=1.0,
 )
 

@@ -23,7 +23,7 @@ from dmsrd_lite.networks import GaussianPolicies, under
 @dataclass(frozen=True)
 class LifelongSettings:
     kl_threshold: float = 0.0  # eps: accept a mixture at or below this divergence (nats); 0: a reference + kl_margin
-    kl_margin: float = 0.0  # nats above the reference (``DMSRD._reference``); 0: the domain's ``threshold_margin``
+    kl_margin: float = 0.5  # nats above the reference (``DMSRD._reference``)
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
     between_class: bool = True
     airl: AIRLSettings = AIRLSettings(n_iterations=12)
@@ -35,6 +35,10 @@ class LifelongSettings:
             raise InputError(f"kl_threshold {self.kl_threshold!r}: expected a positive number of nats, or 0 to calibrate it")
         if self.airl.coverage != self.msrd.coverage:
             raise InputError("coverage is on in only one of airl and msrd: expected both or neither, because MSRD goes on with AIRL's")
+
+
+_LANDER = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=6)  # with 24 the task reward gets worse round by round
+SETTINGS = {"inverted_pendulum": LifelongSettings(), "lunar_lander": LifelongSettings(kl_margin=1.0, msrd=_LANDER)}
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,7 @@ class DMSRD:
         seed, steps = [old.seed, 102, n], {"search": 0, "airl": 0, "msrd": 0}
         learner = self._new_learner(new, [*seed, 2]) if self.domain.matched_starts else None
         reference = self._reference(new, learner, [*seed, 7])
-        threshold = s.kl_threshold or reference + (s.kl_margin or self.domain.threshold_margin)
+        threshold = s.kl_threshold or reference + s.kl_margin
         kl_mix = kl_new = float("inf")
         if m:
             fit = search_mixture(self.policies().actor(), new, s.mixture, [*seed, 1], n_threads=self.n_threads)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from dmsrd_lite import lifelong
 from dmsrd_lite.airl import AIRL, AIRLSettings, Rewards
 from dmsrd_lite.demonstrations import DemonstrationSet, RewardTestSet
 from dmsrd_lite.discrimination import recognized
@@ -26,13 +27,22 @@ class MethodSettings:
     airl: AIRLSettings = AIRLSettings(n_iterations=25)
     msrd: MSRDSettings = MSRDSettings(n_iterations=25, discriminator_steps=24)
     lifelong: LifelongSettings = LifelongSettings()
+    batch_steps: int = 40  # discriminator updates per iteration of AIRL Batch, one model for all the data
 
     def as_in_the_paper(self) -> "MethodSettings":
         """No warm start, no cloning term, no coverage, and AIRL for a new strategy on its own reward alone."""
         off = {"warm_start": False, "cloning_weight": 0.0, "coverage": False}
         airl, msrd = replace(self.lifelong.airl, **off), replace(self.lifelong.msrd, **off)
-        lifelong = replace(self.lifelong, airl=airl, msrd=msrd, add_task_reward=False)
-        return MethodSettings(replace(self.airl, **off), replace(self.msrd, **off), lifelong)
+        loop = replace(self.lifelong, airl=airl, msrd=msrd, add_task_reward=False)
+        return replace(self, airl=replace(self.airl, **off), msrd=replace(self.msrd, **off), lifelong=loop)
+
+
+SETTINGS = {
+    "inverted_pendulum": MethodSettings(),
+    "lunar_lander": MethodSettings(  # in all about as many updates of the task reward as DMSRD makes: more make it worse
+        msrd=MSRDSettings(n_iterations=25, discriminator_steps=10), lifelong=lifelong.SETTINGS["lunar_lander"], batch_steps=10
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -73,7 +83,7 @@ def train_method(method: str, shown: DemonstrationSet, settings: MethodSettings,
         learner = MSRD(shown, settings.msrd, seed, n_threads)
         part, pure, weights = "task", everyone, np.eye(n)
     elif method == "AIRL Batch":
-        learner = AIRL(shown.pooled(), replace(settings.airl, discriminator_steps=40), seed, n_threads)
+        learner = AIRL(shown.pooled(), replace(settings.airl, discriminator_steps=settings.batch_steps), seed, n_threads)
         part, pure, weights = "g", (), np.ones((n, 1))
     else:
         only_clone = {"n_iterations": 0, "coverage": False, "warm_start": True} if method == "cloning" else {}

@@ -56,13 +56,15 @@ class MSRD(AIRL):
     def settle(self) -> int:
         """Update rewards on the samples at hand until each ranks its own demonstration first; how many updates it took.
 
-        Asks only which demonstrations belong to which strategy, simulates nothing, and leaves the policies alone.
+        Asks only which demonstrations belong to which strategy: simulates nothing, and leaves policies and R_Task alone.
         """
+        self.rewards.task_reward.requires_grad_(False)
         update, most = 0, self.settings.between_class_extra if self.between is not None and self.replay else 0
         while update < most and not self.recognized().all():
             self._discriminate([*self.seed, 20, update])
             self._average()
             update += 1
+        self.rewards.task_reward.requires_grad_(True)
         return update
 
     def recognized(self) -> np.ndarray:
