@@ -17,7 +17,7 @@ NAMES = {
     "inverted_pendulum": [*METHODS, *(m + PAPER for m in METHODS if m != "cloning")],
     "lunar_lander": list(METHODS),
 }
-SEEDS = {"inverted_pendulum": (0, 1, 2), "lunar_lander": (0, 1, 2)}
+SEEDS = {"inverted_pendulum": (0, 1, 2), "lunar_lander": (0,)}
 RUNS = {(domain, seed): load_record(f"06_dmsrd_{domain}_seed{seed}") for domain in NAMES for seed in SEEDS[domain]}
 PENDULUM = [key for key in RUNS if key[0] == "inverted_pendulum"]
 LANDER = [key for key in RUNS if key[0] == "lunar_lander"]
@@ -195,8 +195,8 @@ def readme_rows(domain):
         rows.append(f"strategies found {each(results, lambda r: str(len(r['pure']['DMSRD'])))}")
         rows.append(f"ceiling {each(results, lambda r: format(r['ceiling'], '.3f'))}")
         rows.append(f"paid on every step {each(results, lambda r: format(r['every_step'], '.3f'))}")
-        rows.append(f"do not crash {each(results, lambda r: format(r['fresh_spared'], '.0%'))}")
-        rows.append(f"land {each(results, lambda r: str(r['fresh_solved']))} of ten")
+        rows.append(f"{each(results, lambda r: format(r['fresh_spared'], '.0%'))} do not crash")
+        rows.append(f"{each(results, lambda r: str(r['fresh_solved']))} of ten land")
         rows.append(f"second takes {' / '.join(again)}")
         rows.append(f"took {each(results, lambda r: format(sum(x['seconds'] for x in r['records']), '.0f'))} s")
         rows.append(f"new strategies for later mixtures {each(results, lambda r: str(sum(x['steps']['airl'] > 0 for x in r['later'])))}")
