@@ -8,7 +8,9 @@ import numpy as np
 
 from dmsrd_lite.airl import AIRL, AIRLSettings
 from dmsrd_lite.demonstrations import DemonstrationSet, load_shipped
-from dmsrd_lite.envs import INVERTED_PENDULUM, InputError
+from dmsrd_lite.envs import INVERTED_PENDULUM, LUNAR_LANDER, InputError
+from dmsrd_lite.networks import GaussianPolicies
+from dmsrd_lite.rollouts import rollout
 
 
 def simulator_speed(demonstrations: DemonstrationSet, n_environments: int, n_threads: int, n_steps: int = 300) -> float:
@@ -21,6 +23,18 @@ def simulator_speed(demonstrations: DemonstrationSet, n_environments: int, n_thr
     for t in range(n_steps):
         batch.simulate(actions[t])
     return n_environments * n_steps / (time.perf_counter() - start)
+
+
+def worker_speedup(seed: int, n_repeats: int = 3) -> dict[str, float]:
+    """Lander rollouts, policies included, in one process and in two, alternately: median steps per second of each, and their ratio."""
+    actor, speeds = GaussianPolicies(LUNAR_LANDER, 10, seed).actor(), {1: [], 2: []}
+    rollout(LUNAR_LANDER, actor, 2, seed, horizon=10, n_threads=2)  # starts the workers
+    for n in [1, 2] * n_repeats:
+        start = time.perf_counter()
+        steps = rollout(LUNAR_LANDER, actor, 8, seed, n_threads=n).n_steps
+        speeds[n].append(steps / (time.perf_counter() - start))
+    one, two = (float(np.median(speeds[n])) for n in speeds)
+    return {"one_process": round(one), "two_processes": round(two), "ratio": round(two / one, 2)}
 
 
 def bench(seed: int = 0, n_iterations: int = 6) -> dict:
@@ -56,5 +70,6 @@ def bench(seed: int = 0, n_iterations: int = 6) -> dict:
         "ratio": round(round(steps / total) / simulator, 3),
         "simulator_by_threads": {str(n): round(float(np.median(m))) for n, m in speeds.items()},
         "start_up_seconds": round(start_up, 2),
+        "lander": worker_speedup(seed),
         "settings": {**dataclasses.asdict(settings), "n_environments": n_environments, "seed": seed},
     }

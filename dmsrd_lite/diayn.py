@@ -132,6 +132,18 @@ def distances(domain: Domain, shown: DemonstrationSet, actor, seed) -> tuple[np.
     return table - np.diag(table)[:, None], np.diag(table)
 
 
+def good_flights(domain: Domain, actor: Actor, settings: DiaynSettings, n_shown: int, seed: int) -> tuple[np.ndarray, list]:
+    """Share of good starts of every policy (m,), and two takes of ``n_shown`` trajectories of each from its first good ones.
+
+    A start is good if the trajectories of both takes return at least ``domain.success_return`` and do not fail.
+    """
+    starts = draw_reset_seeds(np.random.default_rng([seed, 7]), actor.n_strategies, n_shown * settings.attempts)
+    tried = [rollout(domain, actor, starts.shape[1], [seed, 8, take], reset_seeds=starts) for take in (0, 1)]
+    good = np.all([(data.returns >= domain.success_return) & ~data.failed.any(-1) for data in tried], axis=0)  # (m, starts)
+    first = np.argsort(~good, axis=1, kind="stable")[:, :n_shown]
+    return good.mean(1), [demonstrations_from(data.select_episodes(first), actor) for data in tried]
+
+
 def generate_demonstrations(
     domain: Domain,
     seed: int,
@@ -144,8 +156,7 @@ def generate_demonstrations(
 ) -> dict:
     """Train demonstrators, keep the most distinct of the successful ones, write their demonstrations and a second take.
 
-    A start is good if the trajectories of both takes return at least ``domain.success_return`` and do not fail. Success:
-    ``n_trajectories`` good starts, the first of which are shown, and (without ``matched_starts``) a demonstrator's own
+    Success: ``n_trajectories`` good starts (``good_flights``), and (without ``matched_starts``) a demonstrator's own
     trajectories within ``domain.kl_threshold`` of each other. Of the successful ones those are kept that look most
     different (with ``matched_starts``: are most nats apart), at least ``domain.kl_margin`` nats apart (``distances``).
     Returns the choice as written into the files' metadata; ``InputError`` when too few are left (nothing is written then).
@@ -159,11 +170,8 @@ def generate_demonstrations(
     actor = Actor.joined(actors)
     everyone = np.arange(actor.n_strategies)
     actor = actor.select(everyone, settings.acting_noise)
-    starts = draw_reset_seeds(np.random.default_rng([seed, 7]), len(everyone), n_trajectories * settings.attempts)
-    tried = [rollout(domain, actor, starts.shape[1], [seed, 8, number], reset_seeds=starts) for number in range(len(takes))]
-    good = np.all([(data.returns >= domain.success_return) & ~data.failed.any(-1) for data in tried], axis=0)  # (m, starts)
-    fits, pick = good.sum(1) >= n_trajectories, np.argsort(~good, axis=1, kind="stable")[:, :n_trajectories]
-    shown = [demonstrations_from(data.select_episodes(pick), actor) for data in tried]
+    good, shown = good_flights(domain, actor, settings, n_trajectories, seed)
+    fits = good * settings.attempts >= 1
     if not domain.matched_starts:
         fits &= np.array([own_divergence(domain, o) <= domain.kl_threshold for o in shown[0].observations])
     kept, smallest = np.flatnonzero(fits), 0.0
@@ -181,7 +189,7 @@ def generate_demonstrations(
         )
     choice = {
         "trained": len(everyone),
-        "good_starts": good.mean(1),
+        "good_starts": good,
         "successful": np.flatnonzero(fits),
         "kept": kept,
         "smallest_divergence": smallest,

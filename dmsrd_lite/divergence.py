@@ -68,14 +68,8 @@ def own_divergence(domain: Domain, demonstration: np.ndarray) -> float:
 def divergence_table(domain: Domain, demonstrations: np.ndarray) -> np.ndarray:
     """Every demonstration against every other's trajectories, (n, k, T, d) -> (n, n) nats; the diagonal is ``own_divergence``."""
     n = len(demonstrations)
-    return np.array(
-        [
-            [
-                own_divergence(domain, demonstrations[i])
-                if i == j
-                else demonstration_divergence(domain, demonstrations[i], demonstrations[j])
-                for j in range(n)
-            ]
-            for i in range(n)
-        ]
-    )
+    pairs = [
+        own_divergence(domain, demonstrations[i]) if i == j else demonstration_divergence(domain, demonstrations[i], demonstrations[j])
+        for i, j in np.ndindex(n, n)
+    ]
+    return np.reshape(pairs, (n, n))

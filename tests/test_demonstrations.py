@@ -13,8 +13,9 @@ import pytest
 from dmsrd_lite.__main__ import main
 from dmsrd_lite.airl import AIRL, AIRLSettings
 from dmsrd_lite.demonstrations import load_demonstrations, load_shipped, load_test_set, save_demonstrations, validate_file
-from dmsrd_lite.divergence import divergence_table
+from dmsrd_lite.divergence import demonstration_divergence, divergence_table
 from dmsrd_lite.envs import LUNAR_LANDER, InputError
+from dmsrd_lite.metrics import divergence_floor
 
 
 def arrays_of(demonstrations):
@@ -288,3 +289,25 @@ def test_a_lander_file_made_elsewhere(tmp_path):
     settings = AIRLSettings(n_iterations=1, episodes=1, cloning_steps=5, coverage_episodes=1, discriminator_steps=1)
     *_, record = AIRL(shown, settings, 0).train()
     assert np.isfinite(record["discriminator_loss"]).all()
+
+
+def test_shipped_lander_sets():
+    shown, again = (load_shipped(LUNAR_LANDER, kind) for kind in ("demonstrations", "second_take"))
+    assert shown.actions.shape == again.actions.shape == (10, 3, 500, 2)
+    assert np.array_equal(shown.reset_seeds, again.reset_seeds)
+    assert np.array_equal(shown.observations[:, :, 0], again.observations[:, :, 0])
+    for take in (shown, again):
+        assert take.returns.min() >= LUNAR_LANDER.success_return
+        assert not LUNAR_LANDER.failed(take.observations[:, :, 1:], take.rewards).any()
+    assert shown.metadata["choice"]["smallest_divergence"] >= LUNAR_LANDER.kl_margin
+    floor = divergence_floor(shown, again)
+    others = [[demonstration_divergence(LUNAR_LANDER, a, b) for b in shown.observations] for a in shown.observations]
+    np.fill_diagonal(others := np.array(others), np.inf)
+    assert (others.min(1) > floor + 1).all(), "from other starts everybody is far away"
+    test, development = load_shipped(LUNAR_LANDER, "test_set"), load_shipped(LUNAR_LANDER, "development_set")
+    assert test.observations.shape == (10000, 50, 8)
+    assert development.observations.shape == (1000, 50, 8)
+    assert len({s.metadata["seed"] for s in (shown, test, development)}) == 3
+    assert test.returns.min() < -500
+    assert test.returns.max() > 250
+    assert (test.returns_every_step < -10_000).mean() > 0.1, "wrecks pay on every step"

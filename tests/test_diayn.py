@@ -8,13 +8,18 @@ from dmsrd_lite.demonstrations import load_demonstrations, load_test_set
 from dmsrd_lite.diayn import (
     DiaynSettings,
     StrategyDiscriminator,
+    distances,
     generate_demonstrations,
     generate_test_set,
+    good_flights,
     most_distinct,
     visible_distance,
 )
-from dmsrd_lite.envs import DOMAINS, InputError
+from dmsrd_lite.envs import DOMAINS, LUNAR_LANDER, InputError
+from dmsrd_lite.metrics import policy_divergences
+from dmsrd_lite.networks import GaussianPolicies
 from dmsrd_lite.policy_optimization import TrainingSettings
+from dmsrd_lite.rollouts import rollout
 
 TINY = DiaynSettings(discriminator_steps=2, training=TrainingSettings(n_strategies=2, n_iterations=2, episodes=1, first_horizon=20))
 
@@ -77,3 +82,30 @@ def test_too_few_successes_write_nothing(domain, tmp_path):
     with pytest.raises(InputError, match=r"only 0 of 4 demonstrators .* succeeded, .*; expected 2"):
         generate_demonstrations(domain, 0, tmp_path / "new", settings=TINY, n_kept=2)
     assert list(tmp_path.glob("**/*.npz")) == []
+
+
+def test_only_good_flights_are_shown():
+    """Three of twelve starts, the first at which both takes return enough; the rest by hand."""
+    easy = dataclasses.replace(LUNAR_LANDER, failed=lambda s, r: np.zeros(r.shape, bool))
+    actor = GaussianPolicies(easy, 3, 0).actor()
+    settings = dataclasses.replace(TINY, attempts=4)
+    starts = np.random.default_rng([5, 7]).integers(0, 2**31 - 1, (3, 12))
+    takes = [rollout(easy, actor, 12, [5, 8, take], reset_seeds=starts).returns for take in (0, 1)]
+    bound = float(np.quantile(takes[0], 0.3))
+    share, shown = good_flights(dataclasses.replace(easy, success_return=bound), actor, settings, 3, 5)
+    for j in range(3):
+        good = [e for e in range(12) if takes[0][j, e] >= bound and takes[1][j, e] >= bound]
+        assert 3 <= len(good) < 12, "some starts must be good and some not, or this test says nothing"
+        assert share[j] == len(good) / 12
+        assert shown[0].reset_seeds[j].tolist() == shown[1].reset_seeds[j].tolist() == starts[j, good[:3]].tolist()
+        assert shown[0].returns[j] == pytest.approx(takes[0][j, good[:3]])
+        assert shown[1].returns[j] == pytest.approx(takes[1][j, good[:3]])
+
+
+def test_distances_with_matched_starts_are_above_ones_own(lander_set):
+    actor = GaussianPolicies(LUNAR_LANDER, 2, 0).actor()
+    table, own = distances(LUNAR_LANDER, lander_set, actor, [0])
+    for i in (0, 1):
+        by_hand = policy_divergences(actor, lander_set.select([i]), [0, i], n_rollouts=2)
+        assert own[i] == by_hand[i]
+        assert table[i].tolist() == (by_hand - by_hand[i]).tolist()
