@@ -92,7 +92,7 @@ class RewardTestSet:
     """Trajectories from failure to success with their true returns, to evaluate a reward.
 
     observations (n, T/stride, obs_dim), every ``stride``-th new state; returns (n,) of the whole trajectory; policy (n,),
-    snapshot (n,): who made it and when in training; returns_every_step (n,), or None, when rewards are never stopped.
+    snapshot (n,): who made it and when in training; returns_every_step (n,), never stopped; None where the file lacks it.
     """
 
     domain: Domain

@@ -133,15 +133,15 @@ def distances(domain: Domain, shown: DemonstrationSet, actor, seed) -> tuple[np.
 
 
 def good_flights(domain: Domain, actor: Actor, settings: DiaynSettings, n_shown: int, seed: int) -> tuple[np.ndarray, list]:
-    """Share of good starts of every policy (m,), and two takes of ``n_shown`` trajectories of each from its first good ones.
+    """Which starts are good, (m, starts) bool, and two takes of ``n_shown`` trajectories of every policy from its first good ones.
 
     A start is good if the trajectories of both takes return at least ``domain.success_return`` and do not fail.
     """
     starts = draw_reset_seeds(np.random.default_rng([seed, 7]), actor.n_strategies, n_shown * settings.attempts)
     tried = [rollout(domain, actor, starts.shape[1], [seed, 8, take], reset_seeds=starts) for take in (0, 1)]
-    good = np.all([(data.returns >= domain.success_return) & ~data.failed.any(-1) for data in tried], axis=0)  # (m, starts)
+    good = np.all([(data.returns >= domain.success_return) & ~data.failed.any(-1) for data in tried], axis=0)
     first = np.argsort(~good, axis=1, kind="stable")[:, :n_shown]
-    return good.mean(1), [demonstrations_from(data.select_episodes(first), actor) for data in tried]
+    return good, [demonstrations_from(data.select_episodes(first), actor) for data in tried]
 
 
 def generate_demonstrations(
@@ -171,7 +171,7 @@ def generate_demonstrations(
     everyone = np.arange(actor.n_strategies)
     actor = actor.select(everyone, settings.acting_noise)
     good, shown = good_flights(domain, actor, settings, n_trajectories, seed)
-    fits = good * settings.attempts >= 1
+    fits = good.sum(1) >= n_trajectories
     if not domain.matched_starts:
         fits &= np.array([own_divergence(domain, o) <= domain.kl_threshold for o in shown[0].observations])
     kept, smallest = np.flatnonzero(fits), 0.0
@@ -189,7 +189,7 @@ def generate_demonstrations(
         )
     choice = {
         "trained": len(everyone),
-        "good_starts": good,
+        "good_starts": good.mean(1),
         "successful": np.flatnonzero(fits),
         "kept": kept,
         "smallest_divergence": smallest,

@@ -127,7 +127,7 @@ class TrainingSettings:
 
 
 _FLIGHT = TrainingSettings(episodes=6, first_horizon=500, first_sigma=0.6, last_discount=0.998, ppo=PPOSettings(epochs=4, minibatch=500))
-TRAINING = {"inverted_pendulum": TrainingSettings(), "lunar_lander": _FLIGHT}  # with less noise and far sight a lander only hovers
+TRAINING = {"inverted_pendulum": TrainingSettings(), "lunar_lander": _FLIGHT}  # as on the pendulum, landers crash or hover
 
 
 def anneal(policies: GaussianPolicies, optimizer: PolicyOptimizer, settings: TrainingSettings, share: float) -> None:

@@ -97,11 +97,11 @@ def _in_workers(n: int, jobs: list[tuple]) -> list:
     pickled = [cloudpickle.dumps((_simulate, *job)) for job in jobs]
     main = sys.modules["__main__"]
     try:
-        sys.modules["__main__"] = types.ModuleType("__main__")  # a new worker would import the caller's script, and run it
-        futures = [_workers(n).submit(_call, job) for job in pickled]
-    finally:
-        sys.modules["__main__"] = main
-    try:
+        try:
+            sys.modules["__main__"] = types.ModuleType("__main__")  # a new worker would import the caller's script, and run it
+            futures = [_workers(n).submit(_call, job) for job in pickled]
+        finally:
+            sys.modules["__main__"] = main
         return [future.result() for future in futures]
     except BrokenProcessPool:
         _workers.cache_clear()

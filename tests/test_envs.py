@@ -186,6 +186,20 @@ def test_workers_end_with_the_program(end, tmp_path):
     assert not alive
 
 
+def test_a_worker_that_died_between_calls_is_reported_and_replaced():
+    actor = GaussianPolicies(LUNAR_LANDER, 4, 0).actor()
+    rollout(LUNAR_LANDER, actor, 2, 0, horizon=20, n_threads=2)
+    pool = _workers(2)
+    os.kill(min(pool._processes), signal.SIGKILL)
+    for _ in range(100):
+        if pool._broken:
+            break
+        time.sleep(0.1)
+    with pytest.raises(RuntimeError, match=r"^a simulator process ended before its rollouts were done; expected it to live"):
+        rollout(LUNAR_LANDER, actor, 2, 0, horizon=20, n_threads=2)
+    rollout(LUNAR_LANDER, actor, 2, 0, horizon=20, n_threads=2)
+
+
 def test_lander_frame_shows_the_state():
     high, low = (LUNAR_LANDER.draw_frame(np.array([0.0, y, 0, 0, 0, 0, 0, 0])) for y in (1.0, 0.0))
     body = [np.flatnonzero((f.astype(int).min(-1) > 240).any(1)) for f in (high, low)]
