@@ -4,7 +4,7 @@ BIN := .venv/bin
 .PHONY: workbook test lab lint lock
 
 workbook: .venv/installed
-	$(BIN)/python -m dmsrd_lite workbook --preset quick
+	$(BIN)/python -m dmsrd_lite run papermill_runs/plans/quick.toml
 
 test: .venv/installed lint
 	$(BIN)/python -m pytest

@@ -1,6 +1,7 @@
 """Demonstrators by joint training on task reward + diversity (DIAYN): ``r + lambda (log q(z|s) - log 1/M)``."""
 
 import dataclasses
+import functools
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,12 +20,14 @@ from dmsrd_lite.demonstrations import (
 )
 from dmsrd_lite.divergence import divergence_table, own_divergence
 from dmsrd_lite.envs import Domain, InputError, Population
-from dmsrd_lite.metrics import policy_divergences
+from dmsrd_lite.metrics import divergence_floor, policy_divergences
+from dmsrd_lite.mixture import Mixtures, MixtureSettings, regress_weights, search_mixture
 from dmsrd_lite.networks import Actor, BatchedMLP, to_tensor
 from dmsrd_lite.policy_optimization import TRAINING, TrainingSettings, train_policies
 from dmsrd_lite.rollouts import Rollouts, draw_reset_seeds, rollout
 
-TEST_SEED, DEVELOPMENT_SEED, POPULATION_SEED = 1000, 2000, 3000  # added to a generation's seed: the trainings share nothing
+# Added to a generation's seed, so that the trainings share nothing.
+TEST_SEED, DEVELOPMENT_SEED, POPULATION_SEED, LIFELONG_SEED = 1000, 2000, 3000, 5000
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,77 @@ def good_flights(domain: Domain, actor: Actor, settings: DiaynSettings, n_shown:
     return good, [demonstrations_from(data.select_episodes(first), actor) for data in tried]
 
 
+def train_all_demonstrators(domain: Domain, settings: DiaynSettings, seed: int, progress=iter) -> Actor:
+    """The policies of all of the domain's populations, as they act when they demonstrate."""
+    actors = []
+    for number, population in enumerate(domain.demonstrators):
+        *_, last = progress(train_demonstrators(domain, population, settings, seed + number * POPULATION_SEED))
+        actors.append(last["policies"].actor())
+    actor = Actor.joined(actors)
+    return actor.select(np.arange(actor.n_strategies), settings.acting_noise)
+
+
+def choose_demonstrators(
+    domain: Domain, actor: Actor, settings: DiaynSettings, seed: int, n_kept: int, n_trajectories: int = 3, *, spanning: bool = False
+) -> tuple[np.ndarray, list[DemonstrationSet], dict]:
+    """The most distinct of the successful policies: their indices, two takes of them, and the choice for the metadata.
+
+    Success: ``n_trajectories`` good starts (``good_flights``), and (without ``matched_starts``) a demonstrator's own
+    trajectories within ``domain.kl_threshold`` of each other. Of the successful ones those are kept that look most
+    different (with ``matched_starts``: are most nats apart), at least ``domain.kl_margin`` nats apart (``distances``); or, with
+    ``spanning``, those that are so far from mixtures of each other (``farthest_from_mixtures``).
+    ``InputError`` when too few are left.
+    """
+    good, shown = good_flights(domain, actor, settings, n_trajectories, seed)
+    fits = good.sum(1) >= n_trajectories
+    if not domain.matched_starts:
+        fits &= np.array([own_divergence(domain, o) <= domain.kl_threshold for o in shown[0].observations])
+    kept, smallest, own = np.flatnonzero(fits), 0.0, np.zeros(1)
+    if len(kept) >= n_kept and spanning:
+        pick, far, own = farthest_from_mixtures(actor.select(kept), shown[0].select(kept), n_kept, [seed, 10])
+        kept, smallest = kept[pick], far.min()
+    elif len(kept) >= n_kept:
+        table, own = distances(domain, shown[0].select(kept), actor.select(kept), [seed, 10])
+        nearness = table / domain.kl_margin - 1  # below 0: too near, and dropped first
+        look = table if domain.matched_starts else visible_distance(domain, shown[0].observations[kept])
+        pick = most_distinct(np.where(np.minimum(nearness, nearness.T) < 0, nearness, look), n_kept)
+        smallest = table[np.ix_(pick, pick)][~np.eye(n_kept, dtype=bool)].min()
+        kept = kept[pick]
+    if smallest < domain.kl_margin:
+        raise InputError(
+            f"only {fits.sum()} of {len(fits)} demonstrators of {domain.name} with seed {seed} succeeded, the nearest two kept "
+            f"{smallest:.1f} nats apart; expected {n_kept} at least {domain.kl_margin} apart: train longer or take another seed"
+        )
+    choice = {"trained": len(fits), "good_starts": good.mean(1), "successful": np.flatnonzero(fits), "kept": kept,
+              "smallest_divergence": smallest, "largest_own": own[pick].max()}  # fmt: skip
+    takes = [dataclasses.replace(everybody.select(kept), strategy_labels=np.arange(n_kept)) for everybody in shown]
+    return kept, takes, {name: np.round(value, 3).tolist() for name, value in choice.items()}
+
+
+def farthest_from_mixtures(actor: Actor, shown: DemonstrationSet, n_kept: int, seed) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Policies none of which is a mixture of the others: farthest first, from what the kept ones can be mixed to.
+
+    Distance: KL of the demonstration under the mixture that its actions point at (``regress_weights``), less the KL under its
+    own policy. Returns the indices, each one's distance from the best mixture of the other kept ones (``search_mixture``), and
+    the own KLs of all.
+    """
+    own = policy_divergences(actor, shown, [*seed, 0])
+
+    def distance(kept: list[int]) -> np.ndarray:
+        known = actor.select(kept)
+        weights = [regress_weights(known, shown.select([i])) for i in range(len(own))]
+        return policy_divergences(Mixtures(known, weights), shown, [*seed, 1]) - own
+
+    kept = [int(distance([0]).argmax())]
+    while len(kept) < n_kept:
+        kept.append(int(np.where(np.isin(range(len(own)), kept), -np.inf, distance(kept)).argmax()))
+    far = []
+    for i in kept:
+        others = actor.select([j for j in kept if j != i])
+        far.append(search_mixture(others, shown.select([i]), MixtureSettings(regression=True), [*seed, 2, i]).divergence - own[i])
+    return kept, np.array(far), own
+
+
 def generate_demonstrations(
     domain: Domain,
     seed: int,
@@ -154,54 +228,65 @@ def generate_demonstrations(
     n_trajectories: int = 3,
     progress=iter,
 ) -> dict:
-    """Train demonstrators, keep the most distinct of the successful ones, write their demonstrations and a second take.
+    """Train demonstrators, choose among them (``choose_demonstrators``), write their demonstrations and a second take.
 
-    Success: ``n_trajectories`` good starts (``good_flights``), and (without ``matched_starts``) a demonstrator's own
-    trajectories within ``domain.kl_threshold`` of each other. Of the successful ones those are kept that look most
-    different (with ``matched_starts``: are most nats apart), at least ``domain.kl_margin`` nats apart (``distances``).
     Returns the choice as written into the files' metadata; ``InputError`` when too few are left (nothing is written then).
     """
     settings = settings or SETTINGS[domain.name]
-    takes = {take: check_folder(Path(folder) / f"{domain.name}_{take}.npz") for take in ("demonstrations", "second_take")}
-    actors = []
-    for number, population in enumerate(domain.demonstrators):
-        *_, last = progress(train_demonstrators(domain, population, settings, seed + number * POPULATION_SEED))
-        actors.append(last["policies"].actor())
-    actor = Actor.joined(actors)
-    everyone = np.arange(actor.n_strategies)
-    actor = actor.select(everyone, settings.acting_noise)
-    good, shown = good_flights(domain, actor, settings, n_trajectories, seed)
-    fits = good.sum(1) >= n_trajectories
-    if not domain.matched_starts:
-        fits &= np.array([own_divergence(domain, o) <= domain.kl_threshold for o in shown[0].observations])
-    kept, smallest = np.flatnonzero(fits), 0.0
-    if len(kept) >= n_kept:
-        table, own = distances(domain, shown[0].select(kept), actor.select(kept), [seed, 10])
-        nearness = table / domain.kl_margin - 1  # below 0: too near, and dropped first
-        look = table if domain.matched_starts else visible_distance(domain, shown[0].observations[kept])
-        pick = most_distinct(np.where(np.minimum(nearness, nearness.T) < 0, nearness, look), n_kept)
-        smallest = table[np.ix_(pick, pick)][~np.eye(n_kept, dtype=bool)].min()
-        kept, own = kept[pick], own[pick].max()
-    if smallest < domain.kl_margin:
-        raise InputError(
-            f"only {fits.sum()} of {len(everyone)} demonstrators of {domain.name} with seed {seed} succeeded, the nearest two kept "
-            f"{smallest:.1f} nats apart; expected {n_kept} at least {domain.kl_margin} apart: train longer or take another seed"
-        )
-    choice = {
-        "trained": len(everyone),
-        "good_starts": good.mean(1),
-        "successful": np.flatnonzero(fits),
-        "kept": kept,
-        "smallest_divergence": smallest,
-        "largest_own": own,
-    }
-    choice = {name: np.round(value, 3).tolist() for name, value in choice.items()}
+    paths = {take: check_folder(Path(folder) / f"{domain.name}_{take}.npz") for take in ("demonstrations", "second_take")}
+    actor = train_all_demonstrators(domain, settings, seed, progress)
+    _, shown, choice = choose_demonstrators(domain, actor, settings, seed, n_kept, n_trajectories)
     metadata = {"seed": seed, "choice": choice, "settings": dataclasses.asdict(settings),
                 "made_by": f"python -m dmsrd_lite generate {domain.name} --seed {seed}"}  # fmt: skip
-    for (take, path), everybody in zip(takes.items(), shown, strict=True):
-        some = dataclasses.replace(everybody.select(kept), strategy_labels=np.arange(n_kept), metadata={**metadata, "take": take})
-        save_demonstrations(path, some)
+    for (take, path), some in zip(paths.items(), shown, strict=True):
+        save_demonstrations(path, dataclasses.replace(some, metadata={**metadata, "take": take}))
     return choice
+
+
+def draw_mixtures(
+    domain: Domain, actor: Actor, settings: DiaynSettings, seed: int, n_mixtures: int, least_return: float, n_trajectories: int = 3
+) -> tuple[np.ndarray, list[DemonstrationSet], int]:
+    """Users who are mixtures of an actor's policies: weights (n, M) from Dirichlet(1), two takes, and how many were redrawn.
+
+    A mixture is redrawn when too few of its starts are good (``good_flights``) or its mean return is below ``least_return``.
+    """
+    rng, weights, parts, n_redrawn = np.random.default_rng([seed, 20]), np.zeros((0, actor.n_strategies)), [], 0
+    while len(weights) < n_mixtures:
+        drawn = rng.dirichlet(np.ones(actor.n_strategies), n_mixtures - len(weights))
+        good, shown = good_flights(domain, Mixtures(actor, drawn), settings, n_trajectories, seed + 1 + n_redrawn)
+        fits = (good.sum(1) >= n_trajectories) & (shown[0].returns.mean(1) >= least_return)
+        if not fits.any() and n_redrawn > 10 * n_mixtures:
+            raise InputError(f"{n_redrawn} mixtures of {domain.name} failed one after the other; expected base policies that mix well")
+        weights, n_redrawn = np.vstack([weights, drawn[fits]]), n_redrawn + int((~fits).sum())
+        parts.append([take.select(np.flatnonzero(fits)) for take in shown])
+    takes = [functools.reduce(DemonstrationSet.joined, some) for some in zip(*parts, strict=True)]
+    return weights, takes, n_redrawn
+
+
+def generate_lifelong(
+    domain: Domain, seed: int, folder: Path, *, settings: DiaynSettings | None = None, n_base: int = 5, n_mixtures: int = 95, progress=iter
+) -> dict:
+    """Train demonstrators, choose ``n_base`` of them, and write their demonstrations and those of mixtures of them: a stream of users.
+
+    Beside the choice, the file's metadata holds what is for evaluation only: the true ``weights`` (n, n_base), the
+    demonstrators' ``floor`` (n,) in nats (from a second take) and ``returns`` (n,).
+    """
+    settings = settings or SETTINGS[domain.name]
+    path = check_folder(Path(folder) / f"{domain.name}_lifelong.npz")
+    actor = train_all_demonstrators(domain, settings, seed, progress)
+    kept, takes, choice = choose_demonstrators(domain, actor, settings, seed, n_base, spanning=True)
+    returns = takes[0].returns.mean(1)
+    least = returns.min() - np.ptp(returns)  # clearly below the worst: by more than the best is above it
+    weights, mixed, n_redrawn = draw_mixtures(domain, actor.select(kept), settings, seed + LIFELONG_SEED, n_mixtures, least)
+    shown, again = (base.joined(more) for base, more in zip(takes, mixed, strict=True))
+    labels = {"weights": np.vstack([np.eye(n_base), weights]), "floor": divergence_floor(shown, again), "returns": shown.returns.mean(1)}
+    metadata = {"seed": seed, "choice": {**choice, "redrawn": n_redrawn}, "settings": dataclasses.asdict(settings),
+                "made_by": f"python -m dmsrd_lite generate {domain.name} --lifelong --seed {seed}"}  # fmt: skip
+    metadata |= {name: np.round(value, 4).tolist() for name, value in labels.items()}
+    small = {name: getattr(shown, name).astype(np.float32) for name in ("observations", "actions")}  # half the size of the file
+    shown = dataclasses.replace(shown, **small, rewards=None, strategy_labels=None, metadata=metadata)
+    save_demonstrations(path, shown)
+    return metadata["choice"]
 
 
 def generate_test_set(

@@ -29,6 +29,9 @@ class LifelongSettings:
     airl: AIRLSettings = AIRLSettings(n_iterations=12)
     msrd: MSRDSettings = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=24)  # one round after each demonstration
     mixture: MixtureSettings = MixtureSettings()
+    remembered: int = 0  # how many mixtures among the earlier demonstrations a round works on, drawn anew each time; 0: all
+    measured_rollouts: int = 10  # for the KL before and after a round
+    audit_every: int = 0  # measure KL and recognition of all demonstrations after every so many; 0: never
 
     def __post_init__(self):
         if self.kl_threshold < 0 or not np.isfinite(self.kl_threshold):
@@ -128,7 +131,7 @@ class DMSRD:
         threshold = s.kl_threshold or reference + s.kl_margin
         kl_mix = kl_new = float("inf")
         if m:
-            fit = search_mixture(self.policies().actor(), new, s.mixture, [*seed, 1], n_threads=self.n_threads)
+            fit = search_mixture(self.policies().actor(), new, s.mixture, [*seed, 1], enough=threshold, n_threads=self.n_threads)
             kl_mix, weights, steps["search"] = fit.divergence, fit.weights, fit.steps
         networks, pure, branch = old.networks, old.pure, "mixture"
         if kl_mix > threshold:
@@ -143,18 +146,21 @@ class DMSRD:
         table[:n, :m], table[n] = old.weights, weights
         known = new if old.demonstrations is None else old.demonstrations.joined(new)
         state = replace(old, demonstrations=known, weights=table, pure=pure, networks=networks)
-        thresholds = [*(r["threshold"] for r in old.records), threshold]
-        before, searched = self._divergences(state, [*seed, 3]), {}
+        some = self._remembered(state, [*seed, 6])
+        thresholds = np.array([*(r["threshold"] for r in old.records), threshold])[some]
+        before, searched = self._divergences(state, some, [*seed, 3]), {}
         if len(pure) > 1:
-            networks, steps["msrd"] = self._round(state, [*seed, 4])
+            networks, steps["msrd"] = self._round(state, some, [*seed, 4])
             state = replace(state, networks=networks)
-        after = self._divergences(state, [*seed, 3]) if len(pure) > 1 else before
+        after = self._divergences(state, some, [*seed, 3]) if len(pure) > 1 else before
         risen = (before <= thresholds) & (after > thresholds)
-        for i in set(np.flatnonzero(risen)) - {*pure, n}:  # a mixture that its own strategies have moved away from
+        for i, kl in zip(some[risen], after[risen], strict=True):  # a mixture that its own strategies have moved away from
+            if i in {*pure, n}:
+                continue
             one, policies = known.select([i]), self._at(state).policies().actor()
             fit = search_mixture(policies, one, s.mixture, [*seed, 5, i], incumbent=table[i], n_threads=self.n_threads)
-            searched[i], steps["search"] = [after[i], fit.divergence], steps["search"] + fit.steps
-            table[i] = fit.weights if fit.divergence < after[i] else table[i]
+            searched[int(i)], steps["search"] = [kl, fit.divergence], steps["search"] + fit.steps
+            table[i] = fit.weights if fit.divergence < kl else table[i]
         record = {
             "demonstration": n,
             "branch": branch,
@@ -165,13 +171,31 @@ class DMSRD:
             "weights": weights,
             "n_strategies": len(pure),
             "steps": steps,
+            "remembered": some,
             "kl_before_round": before,
             "kl_after_round": after,
             "searched_again": searched,
-            "recognized": recognized(self._at(state).rewards().evaluate(known.observations).mean((2, 3)), pure),
+            "recognized": self._recognized(state, some),
             "seconds": time.perf_counter() - started,
         }
+        if s.audit_every and (n + 1) % s.audit_every == 0:
+            everyone = np.arange(n + 1)
+            record["audit"] = {"kl": self._divergences(state, everyone, [*seed, 8]), "recognized": self._recognized(state, everyone)}
         return replace(state, records=(*old.records, plain(record)))
+
+    def _remembered(self, state: LifelongState, seed) -> np.ndarray:
+        """The demonstrations that this round works on: the pure ones, the newest, and a bounded sample of the others."""
+        everyone = np.arange(len(state.weights))
+        others = np.setdiff1d(everyone, [*state.pure, everyone[-1]])
+        if not 0 < self.settings.remembered < len(others):
+            return everyone
+        drawn = np.random.default_rng(seed).choice(others, self.settings.remembered, replace=False)
+        return np.union1d(np.setdiff1d(everyone, others), drawn)
+
+    def _recognized(self, state: LifelongState, some: np.ndarray) -> np.ndarray:
+        """Does each strategy reward rank its pure demonstration first among ``some``? (M,) bool."""
+        means = self._at(state).rewards().evaluate(state.demonstrations.select(some).observations).mean((2, 3))
+        return recognized(means, np.searchsorted(some, state.pure))
 
     def _reference(self, new: DemonstrationSet, learner: AIRL | None, seed) -> float:
         """How near a good explanation comes to a demonstration, without labels, in nats.
@@ -203,10 +227,11 @@ class DMSRD:
         old = self.state.networks
         return {k: (old[k] if _is_shared(k) else torch.cat([old[k], v])) if old else v for k, v in new.items()}
 
-    def _round(self, state: LifelongState, seed) -> tuple[dict[str, torch.Tensor], int]:
-        """MSRD on the pure demonstrations with BCD on all of them; returns the networks and the steps of all strategies."""
+    def _round(self, state: LifelongState, some: np.ndarray, seed) -> tuple[dict[str, torch.Tensor], int]:
+        """MSRD on the pure demonstrations with BCD on ``some``; returns the networks and the steps of all strategies."""
         s, pure = self.settings, state.pure
-        between = (state.demonstrations, state.weights, pure) if s.between_class else None
+        known = state.demonstrations.select(some), state.weights[some], np.searchsorted(some, pure)
+        between = known if s.between_class else None
         learner = MSRD(state.demonstrations.select(pure), s.msrd, seed, self.n_threads, networks=state.networks, between=between)
         learner.n_averaged = s.msrd.n_iterations * sum(r["n_strategies"] > 1 for r in state.records)
         for _ in learner.train():
@@ -217,9 +242,10 @@ class DMSRD:
     def _at(self, state: LifelongState) -> "DMSRD":
         return DMSRD(self.domain, self.settings, state.seed, self.n_threads, state)
 
-    def _divergences(self, state: LifelongState, seed) -> np.ndarray:
-        """KL of every demonstration so far under what explains it, (n,)."""
-        return policy_divergences(self._at(state).mixtures(), state.demonstrations, seed, n_threads=self.n_threads)
+    def _divergences(self, state: LifelongState, some: np.ndarray, seed) -> np.ndarray:
+        """KL of the demonstrations ``some`` under what explains them, (n,)."""
+        mixtures, shown = Mixtures(self._at(state).policies().actor(), state.weights[some]), state.demonstrations.select(some)
+        return policy_divergences(mixtures, shown, seed, n_rollouts=self.settings.measured_rollouts, n_threads=self.n_threads)
 
 
 _FORMAT, _VERSION = "dmsrd_lite lifelong state", 1

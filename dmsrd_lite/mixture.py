@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 
 from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.envs import InputError
@@ -60,6 +61,7 @@ class MixtureSettings:
     search_rollouts: int = 2  # per candidate, to choose the finalists
     n_finalists: int = 6
     final_rollouts: int = 10  # of the protocol (``policy_divergences``)
+    regression: bool = False  # try ``regress_weights`` first; near enough, it saves the search (beyond the paper)
 
 
 @dataclass(frozen=True)
@@ -73,14 +75,39 @@ class MixtureFit:
     steps: int  # environment steps spent
 
 
+def regress_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
+    """The mixture whose means are nearest to what one demonstrator did: weights (M,), without a rollout.
+
+    ``min_w sum_t |a_t - sum_j w_j mu_j(s_t)|^2`` over the simplex, actions in half ranges: the most likely weights if sigma did
+    not depend on them. An action at a bound is left out, because it was wished larger.
+    """
+    domain, actions = demonstration.domain, demonstration.actions[0].reshape(-1, demonstration.domain.action_dim)
+    states = demonstration.observations[0, :, : demonstration.horizon].reshape(1, len(actions), -1)
+    low, high = np.array(domain.action_low), np.array(domain.action_high)
+    inside = (actions > low + 1e-6) & (actions < high - 1e-6)
+    scale = np.broadcast_to((high - low) / 2, actions.shape)[inside]
+    a = (actor.mean(states)[:, inside] / scale).T.astype(np.float64)  # (steps inside, M)
+    one = 1e3 * np.sqrt(1 + len(a))  # a row that holds the sum of the weights at one
+    weights, _ = nnls(np.vstack([a, np.full((1, a.shape[1]), one)]), np.append(actions[inside] / scale, one))
+    return weights / weights.sum()
+
+
 def search_mixture(
-    actor: Actor, demonstration: DemonstrationSet, settings: MixtureSettings, seed, *, incumbent=None, n_threads: int = 0
+    actor: Actor,
+    demonstration: DemonstrationSet,
+    settings: MixtureSettings,
+    seed,
+    *,
+    incumbent=None,
+    enough: float = 0.0,
+    n_threads: int = 0,
 ) -> MixtureFit:
     """Random search on the simplex for the mixture whose rollouts are nearest to one demonstration (a set of one).
 
     Candidates: the pure strategies, the incumbent, Dirichlet(1) draws, half of them cut down to two or three strategies, then
     refinements around the best; each round is one batch of rollouts. The finalists are measured by the protocol of
     every KL here, and the winner once more on rollouts of its own, because the least of several noisy numbers is too low.
+    With ``regression`` those weights are measured first, and taken if they come within ``enough`` nats.
     """
     m, s, rng = actor.n_strategies, settings, np.random.default_rng(seed)
     if demonstration.n_demonstrations != 1:
@@ -101,6 +128,12 @@ def search_mixture(
         steps += len(weights) * n_rollouts * demonstration.horizon
         return policy_divergences(Mixtures(actor, weights), demonstration, [*seeds, part], n_rollouts=n_rollouts, n_threads=n_threads)
 
+    if s.regression and m > 1:
+        regressed = regress_weights(actor, demonstration)[None]
+        divergences = measure(regressed, 5, s.final_rollouts)
+        if divergences[0] <= enough:
+            return MixtureFit(regressed[0], float(divergences[0]), regressed, divergences, steps)
+        candidates = np.vstack([candidates, regressed])
     divergences = measure(candidates, 1, s.search_rollouts)
     if m > 1 and s.n_refinements:
         around = rng.dirichlet(s.concentration * candidates[divergences.argmin()] + 0.1, s.n_refinements)

@@ -17,6 +17,8 @@ import numpy as np
 from dmsrd_lite.envs import Domain
 from dmsrd_lite.networks import gaussian_log_density
 
+simulated = {"steps": 0}  # environment steps of this process so far, for ``runs.hand_over``; decides nothing
+
 
 @dataclass
 class Rollouts:
@@ -137,6 +139,7 @@ def rollout(domain: Domain, actor, n_episodes: int, seed, *, reset_seeds=None, h
             parts = list(pool.map(lambda job: _simulate(*job), jobs))
     joined = (np.concatenate(arrays, axis=2) for arrays in zip(*parts, strict=True))
     observations, actions, rewards, ended = (np.moveaxis(array, 0, 2) for array in joined)
+    simulated["steps"] += rewards.size
     over_before = (ended.cumsum(2) - ended) > 0
     paid_once = np.where(over_before, 0.0, rewards)
     return Rollouts(domain, observations, actions, np.moveaxis(log_densities, 0, 2), paid_once, reset_seeds, rewards)

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import platform
 import re
 import time
@@ -13,6 +14,7 @@ import numpy as np
 
 from dmsrd_lite.demonstrations import plain, write_atomically
 from dmsrd_lite.envs import InputError
+from dmsrd_lite.rollouts import simulated
 
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = ROOT / "notebooks"
@@ -30,10 +32,14 @@ def check_preset(preset: str) -> str:
 
 
 def hand_over(**results) -> None:
-    """Show results as a JSON output of the cell, so that the executed notebook itself carries them."""
+    """Show results as a JSON output of the cell, so that the executed notebook itself carries them.
+
+    Adds ``environment_steps``, all that were simulated in this notebook so far. Results named ``seconds`` or
+    ``..._seconds`` are kept out of a run's metrics (``plans``), because they are never the same twice.
+    """
     from IPython.display import publish_display_data
 
-    results = plain(results)
+    results = plain({**results, "environment_steps": simulated["steps"]})
     publish_display_data({_MIME: results, "text/plain": json.dumps(results, indent=1)})
 
 
@@ -59,6 +65,11 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{p: version(p).split("+")[0] for p in packages}}
 
 
+def machine() -> dict[str, str | int]:
+    """What kind of machine this is."""
+    return {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count() or 1}
+
+
 def save_record(name: str, parameters: dict, results: dict, tensors: dict[str, np.ndarray], folder: Path = RECORDS) -> Path:
     """Write ``name.json`` (parameters, versions, machine, results) and ``name.safetensors`` (final networks), atomically."""
     from safetensors.numpy import save
@@ -67,7 +78,7 @@ def save_record(name: str, parameters: dict, results: dict, tensors: dict[str, n
         "name": name,
         "parameters": parameters,
         "versions": versions(),
-        "machine": {"system": platform.system(), "processor": platform.machine()},
+        "machine": machine(),
         "results": results,
     }
     text = json.dumps(plain(record), indent=1)
@@ -94,8 +105,11 @@ def lessons() -> list[Path]:
     return sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))
 
 
-def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT) -> tuple[str, float]:
-    """Run one notebook with papermill; returns ("" or the error in one line, seconds). The executed copy is kept either way."""
+def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT, cell_seconds: float = 0.0) -> tuple[str, float]:
+    """Run one notebook with papermill; returns ("" or the error in one line, seconds). The executed copy is kept either way.
+
+    A cell that takes longer than ``cell_seconds`` counts as failed (0: ``CELL_LIMITS`` of the preset).
+    """
     import papermill
     from papermill.exceptions import PapermillExecutionError
 
@@ -109,31 +123,13 @@ def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT) -> 
             progress_bar=False,
             kernel_name="python3",
             cwd=str(folder),
-            execution_timeout=CELL_LIMITS.get(parameters.get("preset"), CELL_LIMITS["full"]),
+            execution_timeout=int(cell_seconds or CELL_LIMITS.get(parameters.get("preset"), CELL_LIMITS["full"])),
         )
     except PapermillExecutionError as failure:
         error = f"cell {failure.exec_count}: {failure.ename}: {failure.evalue}"
     except Exception as failure:  # a dead kernel or a time-out; whatever it is, the other notebooks go on
         error = f"{type(failure).__name__}: {(str(failure).strip() or 'no message').splitlines()[0]}"
     return error, time.perf_counter() - start
-
-
-def workbook(preset: str, output: Path | None = None, parameters: dict | None = None) -> bool:
-    """Execute all lessons in order with ``preset``; print a table; True when none failed."""
-    from tqdm import tqdm
-
-    output = output or ROOT / "papermill_runs" / check_preset(preset)
-    rows = []
-    with tqdm(lessons(), unit="notebook") as bar:
-        for path in bar:
-            bar.set_description(path.stem)
-            rows.append((path.stem, *execute(path, output / path.name, {"preset": preset, **(parameters or {})})))
-    width = max(len(name) for name, *_ in rows)
-    print(f"{'notebook':<{width}}  seconds  ok")
-    for name, error, seconds in rows:
-        print(f"{name:<{width}}  {seconds:7.1f}  {'yes' if not error else 'NO: ' + error}")
-    print(f"executed copies: {output}")
-    return not any(error for _, error, _ in rows)
 
 
 def export_gallery(executed: Path, output: Path = ROOT / "papermill_runs" / "gallery") -> list[Path]:

@@ -238,7 +238,7 @@ def test_read_only_folder(small_set, tmp_path):
         (["generate", "cartpole"], "unknown domain 'cartpole'"),
         (["generate", "inverted_pendulum", "--seed", "1.5"], "seed '1.5': expected a whole number"),
         (["generate", "inverted_pendulum", "--output", "FILE/x"], "cannot be written to"),
-        (["workbook", "--preset", "huge"], "unknown preset 'huge': expected one of quick, full"),
+        (["run", "none.toml"], "cannot be read as a plan"),
         (["bench", "--seed", "x"], "seed 'x': expected a whole number"),
         (["bench", "--iterations", "1"], "iterations 1: expected at least 2"),
     ],

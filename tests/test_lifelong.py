@@ -22,7 +22,7 @@ TINY = LifelongSettings(kl_threshold=1e-3, airl=AIRLSettings(**SHORT), msrd=MSRD
                         mixture=MixtureSettings(4, 2, search_rollouts=1, n_finalists=2, final_rollouts=2))  # fmt: skip
 GENEROUS = dataclasses.replace(TINY, kl_threshold=1e9)  # every mixture will do
 FIELDS = {"demonstration", "branch", "kl_mix", "kl_new", "reference", "threshold", "weights", "n_strategies", "steps",
-          "kl_before_round", "kl_after_round", "searched_again", "recognized", "seconds"}  # fmt: skip
+          "remembered", "kl_before_round", "kl_after_round", "searched_again", "recognized", "seconds"}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -30,19 +30,3 @@ def test_claims_raise_only_when_strict(capsys):
     assert capsys.readouterr().out == "holds:         one\ndoes not hold: two\n"
     with pytest.raises(AssertionError, match="three"):
         runs.claim(False, "three", strict=True)
-
-
-def test_a_failing_notebook_is_reported_and_kept(tmp_path, monkeypatch, capsys):
-    import nbformat
-    from nbformat.v4 import new_code_cell, new_notebook
-
-    kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
-    for name, source in (("00_good", "1 + 1"), ("01_bad", "raise ValueError('on purpose')")):
-        parameters = new_code_cell('preset: str = "quick"  # size', metadata={"tags": ["parameters"]})
-        nbformat.write(new_notebook(cells=[parameters, new_code_cell(source)], metadata=kernel), tmp_path / f"{name}.ipynb")
-    monkeypatch.setattr(runs, "NOTEBOOKS", tmp_path)
-    assert runs.workbook("quick", tmp_path / "out") is False
-    printed = capsys.readouterr().out
-    assert "00_good" in printed
-    assert ": ValueError: on purpose" in printed
-    assert (tmp_path / "out" / "01_bad.ipynb").is_file()
