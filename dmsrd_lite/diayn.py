@@ -21,13 +21,14 @@ from dmsrd_lite.demonstrations import (
 from dmsrd_lite.divergence import divergence_table, own_divergence
 from dmsrd_lite.envs import Domain, InputError, Population
 from dmsrd_lite.metrics import divergence_floor, policy_divergences
-from dmsrd_lite.mixture import Mixtures, MixtureSettings, regress_weights, search_mixture
-from dmsrd_lite.networks import Actor, BatchedMLP, to_tensor
-from dmsrd_lite.policy_optimization import TRAINING, TrainingSettings, train_policies
+from dmsrd_lite.mixture import Mixtures, regress_weights
+from dmsrd_lite.networks import Actor, BatchedMLP, GaussianPolicies, to_tensor
+from dmsrd_lite.policy_optimization import TRAINING, TrainingSettings, clone_behavior, train_policies
 from dmsrd_lite.rollouts import Rollouts, draw_reset_seeds, rollout
 
 # Added to a generation's seed, so that the trainings share nothing.
 TEST_SEED, DEVELOPMENT_SEED, POPULATION_SEED, LIFELONG_SEED = 1000, 2000, 3000, 5000
+OUTSIDE = 1.0  # nats from any mixture of the others, for users who found strategies of their own: twice what lesson 06 allows
 
 
 @dataclass(frozen=True)
@@ -162,20 +163,20 @@ def choose_demonstrators(
 ) -> tuple[np.ndarray, list[DemonstrationSet], dict]:
     """The most distinct of the successful policies: their indices, two takes of them, and the choice for the metadata.
 
-    Success: ``n_trajectories`` good starts (``good_flights``), and (without ``matched_starts``) a demonstrator's own
-    trajectories within ``domain.kl_threshold`` of each other. Of the successful ones those are kept that look most
+    Success: ``n_trajectories`` good starts (``good_flights``), and (without ``matched_starts`` or ``spanning``) a demonstrator's
+    own trajectories within ``domain.kl_threshold`` of each other. Of the successful ones those are kept that look most
     different (with ``matched_starts``: are most nats apart), at least ``domain.kl_margin`` nats apart (``distances``); or, with
-    ``spanning``, those that are so far from mixtures of each other (``farthest_from_mixtures``).
+    ``spanning``, those that are at least ``OUTSIDE`` nats from mixtures of each other (``farthest_from_mixtures``).
     ``InputError`` when too few are left.
     """
     good, shown = good_flights(domain, actor, settings, n_trajectories, seed)
     fits = good.sum(1) >= n_trajectories
-    if not domain.matched_starts:
+    if not (domain.matched_starts or spanning):
         fits &= np.array([own_divergence(domain, o) <= domain.kl_threshold for o in shown[0].observations])
-    kept, smallest, own = np.flatnonzero(fits), 0.0, np.zeros(1)
+    kept, smallest, own, least = np.flatnonzero(fits), 0.0, np.zeros(1), OUTSIDE if spanning else domain.kl_margin
     if len(kept) >= n_kept and spanning:
         pick, far, own = farthest_from_mixtures(actor.select(kept), shown[0].select(kept), n_kept, [seed, 10])
-        kept, smallest = kept[pick], far.min()
+        kept, smallest = kept[pick], far.min() if len(pick) == n_kept else 0.0
     elif len(kept) >= n_kept:
         table, own = distances(domain, shown[0].select(kept), actor.select(kept), [seed, 10])
         nearness = table / domain.kl_margin - 1  # below 0: too near, and dropped first
@@ -183,10 +184,10 @@ def choose_demonstrators(
         pick = most_distinct(np.where(np.minimum(nearness, nearness.T) < 0, nearness, look), n_kept)
         smallest = table[np.ix_(pick, pick)][~np.eye(n_kept, dtype=bool)].min()
         kept = kept[pick]
-    if smallest < domain.kl_margin:
+    if smallest < least:
         raise InputError(
             f"only {fits.sum()} of {len(fits)} demonstrators of {domain.name} with seed {seed} succeeded, the nearest two kept "
-            f"{smallest:.1f} nats apart; expected {n_kept} at least {domain.kl_margin} apart: train longer or take another seed"
+            f"{smallest:.1f} nats apart; expected {n_kept} at least {least} apart: train longer or take another seed"
         )
     choice = {"trained": len(fits), "good_starts": good.mean(1), "successful": np.flatnonzero(fits), "kept": kept,
               "smallest_divergence": smallest, "largest_own": own[pick].max()}  # fmt: skip
@@ -195,27 +196,35 @@ def choose_demonstrators(
 
 
 def farthest_from_mixtures(actor: Actor, shown: DemonstrationSet, n_kept: int, seed) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Policies none of which is a mixture of the others: farthest first, from what the kept ones can be mixed to.
+    """Demonstrators none of whom is a mixture of the others, judged as a learner would, by their clones: farthest first.
 
-    Distance: KL of the demonstration under the mixture that its actions point at (``regress_weights``), less the KL under its
-    own policy. Returns the indices, each one's distance from the best mixture of the other kept ones (``search_mixture``), and
-    the own KLs of all.
+    Distance: KL of the demonstration under the mixture of the kept clones that its actions point at (``regress_weights``), less
+    the KL under its own clone. Who comes within ``OUTSIDE`` of mixtures of those kept later is dropped again. Left out are
+    those who cannot be imitated: whose clone is half of ``OUTSIDE`` farther, or fails 1 time in 20 more often, than they are.
+    Returns the indices, each one's distance from mixtures of the other kept ones, and the demonstrators' own KLs, all.
     """
-    own = policy_divergences(actor, shown, [*seed, 0])
+    domain, everyone = shown.domain, np.arange(shown.n_demonstrations)
+    states, actions, _ = shown.transitions()
+    cloned = GaussianPolicies(domain, len(everyone), [*seed, 3])
+    clone_behavior(cloned, to_tensor(domain.network_input(states)), to_tensor(actions), [*seed, 4], n_steps=2000)
+    clones = cloned.actor()
+    own, reached = (policy_divergences(some, shown, [*seed, 0]) for some in (actor, clones))
+    fails, clones_fail = (rollout(domain, some, 20, [*seed, 5]).failed.any(-1).mean(1) for some in (actor, clones))
+    left = list(everyone[(reached - own <= OUTSIDE / 2) & (clones_fail - fails <= 0.05)])
 
-    def distance(kept: list[int]) -> np.ndarray:
-        known = actor.select(kept)
-        weights = [regress_weights(known, shown.select([i])) for i in range(len(own))]
-        return policy_divergences(Mixtures(known, weights), shown, [*seed, 1]) - own
+    def distance(kept: list[int], who: list[int]) -> np.ndarray:
+        known = clones.select(kept)
+        weights = [regress_weights(known, shown.select([i])) for i in who]
+        return policy_divergences(Mixtures(known, weights), shown.select(who), [*seed, 1]) - reached[who]
 
-    kept = [int(distance([0]).argmax())]
-    while len(kept) < n_kept:
-        kept.append(int(np.where(np.isin(range(len(own)), kept), -np.inf, distance(kept)).argmax()))
-    far = []
-    for i in kept:
-        others = actor.select([j for j in kept if j != i])
-        far.append(search_mixture(others, shown.select([i]), MixtureSettings(regression=True), [*seed, 2, i]).divergence - own[i])
-    return kept, np.array(far), own
+    kept: list[int] = []
+    while left and len(kept) < n_kept:
+        far = distance(kept or [left[0]], left)
+        kept.append(left.pop(int(far.argmax())))
+        for i in kept[:-1]:
+            if len(kept) > 2 and distance([j for j in kept if j != i], [i])[0] < OUTSIDE:
+                kept.remove(i)
+    return kept, np.array([distance([j for j in kept if j != i], [i])[0] for i in kept]), own
 
 
 def generate_demonstrations(

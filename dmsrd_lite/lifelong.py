@@ -2,6 +2,7 @@
 
 import json
 import time
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from dmsrd_lite.airl import AIRL, AIRLSettings, Rewards
-from dmsrd_lite.demonstrations import DemonstrationSet, plain, write_atomically
+from dmsrd_lite.demonstrations import DemonstrationSet, check_folder, plain, write_atomically
 from dmsrd_lite.discrimination import recognized
 from dmsrd_lite.divergence import own_divergence
 from dmsrd_lite.envs import Domain, InputError
@@ -29,6 +30,7 @@ class LifelongSettings:
     airl: AIRLSettings = AIRLSettings(n_iterations=12)
     msrd: MSRDSettings = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=24)  # one round after each demonstration
     mixture: MixtureSettings = MixtureSettings()
+    task_after_mixture: bool = True  # R_Task learns in the round after a mixture, too (the paper), or only with new strategies
     remembered: int = 0  # how many mixtures among the earlier demonstrations a round works on, drawn anew each time; 0: all
     measured_rollouts: int = 10  # for the KL before and after a round
     audit_every: int = 0  # measure KL and recognition of all demonstrations after every so many; 0: never
@@ -150,7 +152,8 @@ class DMSRD:
         thresholds = np.array([*(r["threshold"] for r in old.records), threshold])[some]
         before, searched = self._divergences(state, some, [*seed, 3]), {}
         if len(pure) > 1:
-            networks, steps["msrd"] = self._round(state, some, [*seed, 4])
+            learn_task = s.task_after_mixture or branch == "new strategy"
+            networks, steps["msrd"] = self._round(state, some, learn_task, [*seed, 4])
             state = replace(state, networks=networks)
         after = self._divergences(state, some, [*seed, 3]) if len(pure) > 1 else before
         risen = (before <= thresholds) & (after > thresholds)
@@ -227,13 +230,14 @@ class DMSRD:
         old = self.state.networks
         return {k: (old[k] if _is_shared(k) else torch.cat([old[k], v])) if old else v for k, v in new.items()}
 
-    def _round(self, state: LifelongState, some: np.ndarray, seed) -> tuple[dict[str, torch.Tensor], int]:
+    def _round(self, state: LifelongState, some: np.ndarray, learn_task: bool, seed) -> tuple[dict[str, torch.Tensor], int]:
         """MSRD on the pure demonstrations with BCD on ``some``; returns the networks and the steps of all strategies."""
         s, pure = self.settings, state.pure
         known = state.demonstrations.select(some), state.weights[some], np.searchsorted(some, pure)
         between = known if s.between_class else None
         learner = MSRD(state.demonstrations.select(pure), s.msrd, seed, self.n_threads, networks=state.networks, between=between)
         learner.n_averaged = s.msrd.n_iterations * sum(r["n_strategies"] > 1 for r in state.records)
+        learner.rewards.task_reward.requires_grad_(learn_task)
         for _ in learner.train():
             pass
         learner.settle()
@@ -292,3 +296,32 @@ def load_state(path, domain: Domain) -> LifelongState:
         under("networks", tensors),
         tuple(header["records"]),
     )
+
+
+def learn_stream(learner: DMSRD, shown: DemonstrationSet, folder) -> Iterator[dict]:
+    """``learner.learn`` with a checkpoint in ``folder`` after every demonstration; goes on from the newest one that can be read.
+
+    Killed at any moment and called again with the same arguments, it redoes at most the demonstration that was in flight and
+    ends with the bits of an uninterrupted run. Two files take turns: one that was spoiled costs one demonstration. Yields the
+    records of all demonstrations, those of earlier calls first. ``InputError`` when the folder holds another stream.
+    """
+    folder, states = Path(folder).resolve(), [learner.state]
+    check_folder(folder / "any")
+    made_with, note = repr((learner.domain.name, learner.state.seed, learner.settings)), folder / "settings.txt"
+    if note.exists() and note.read_text() != made_with:
+        raise InputError(f"{folder}: holds checkpoints made with another seed or other settings; expected the same, or another folder")
+    write_atomically(note, lambda file: file.write(made_with.encode()))
+    for path in sorted(folder.glob("checkpoint_*.safetensors")):
+        try:
+            states.append(load_state(path, learner.domain))
+        except InputError as error:
+            warnings.warn(f"{error}; going on from the checkpoint before it", stacklevel=2)
+    learner.state = state = max(states, key=lambda state: len(state.records))
+    n = len(state.records)
+    known = state.demonstrations.arrays() if n else {}
+    if any(not np.array_equal(array, getattr(shown, name)[:n]) for name, array in known.items()):
+        raise InputError(f"{folder}: holds checkpoints of other demonstrations; expected the same stream, or another folder")
+    yield from state.records
+    for record in learner.learn(shown.select(range(n, shown.n_demonstrations))):
+        save_state(folder / f"checkpoint_{len(learner.state.records) % 2}.safetensors", learner.state)
+        yield record

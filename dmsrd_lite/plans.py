@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import tempfile
+import time
 import tomllib
 from collections import deque
 from collections.abc import Iterator
@@ -226,6 +227,7 @@ def run_text(text: str, name: str, parameters: dict, source: str, cell_seconds: 
     here = source_hash(nbformat.reads(text, 4))
     if here != source:
         return {"error": f"this worker has another dmsrd_lite ({here}); expected the caller's ({source})", "text": ""}
+    os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # Dask sets it to save memory; a kernel that inherits it takes 1.7 times as long
     with tempfile.TemporaryDirectory(prefix="dmsrd_lite_") as scratch:
         given, executed = Path(scratch) / f"{name}.ipynb", Path(scratch) / "executed.ipynb"
         given.write_text(text)
@@ -252,6 +254,9 @@ def _untimed(results):
     return {k: _untimed(v) for k, v in results.items() if k != "seconds" and not k.endswith("_seconds")}
 
 
+_DEAF = "import signal; signal.signal(signal.SIGINT, lambda *_: None)"  # an interrupt is the caller's business, not a worker's
+
+
 @contextmanager
 def _cluster(workers: int, scheduler: str) -> Iterator:
     """A Dask client: of workers on this machine, processes with one thread each, or of a scheduler that runs somewhere."""
@@ -259,6 +264,8 @@ def _cluster(workers: int, scheduler: str) -> Iterator:
 
     from distributed import Client, LocalCluster
 
+    for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is said by us, in a sentence
     if scheduler:
         try:
             client = Client(scheduler, timeout=10)
@@ -270,7 +277,13 @@ def _cluster(workers: int, scheduler: str) -> Iterator:
             yield client
         return
     with tempfile.TemporaryDirectory(prefix="dmsrd_lite_") as scratch:
-        local = {"dashboard_address": None, "memory_limit": 0, "local_directory": scratch, "silence_logs": logging.CRITICAL}
+        local = {
+            "preload": [_DEAF],
+            "dashboard_address": None,
+            "memory_limit": 0,
+            "local_directory": scratch,
+            "silence_logs": logging.CRITICAL,
+        }
         with LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **local) as cluster:
             with Client(cluster) as client:
                 yield client
@@ -315,27 +328,33 @@ def _selected(plan: Plan, only) -> list[Run]:
 
 def _results(client, plan: Plan, todo: list[Run]) -> Iterator[tuple[Run, dict]]:
     """Each run and its answer as they come; no more runs are under way than the cluster has threads."""
-    from distributed import wait
+    from distributed import CancelledError, wait
     from tqdm import tqdm
 
-    waiting, running, failed = deque(todo), {}, 0
+    waiting, running, failed, shown = deque(todo), {}, 0, ""
     with tqdm(total=len(todo), unit="run", smoothing=0, dynamic_ncols=True) as bar:
         while waiting or running:
-            threads = sum(client.nthreads().values())
+            try:
+                threads = sum(client.nthreads().values())
+            except (OSError, TimeoutError):
+                raise InputError(_GONE) from None
             while waiting and len(running) < threads:
                 run = waiting.popleft()
-                text, limit = (
-                    run.notebook.read_text(),
-                    plan.cell_seconds or CELL_LIMITS.get(run.parameters.get("preset"), CELL_LIMITS["full"]),
-                )
-                task = (text, run.name, run.parameters, run.source, limit, str(Path.cwd()))
+                limit = plan.cell_seconds or CELL_LIMITS.get(run.parameters.get("preset"), CELL_LIMITS["full"])
+                task = (run.notebook.read_text(), run.name, run.parameters, run.source, limit, str(Path.cwd()))
                 running[client.submit(run_text, *task, key=f"{run.name}-{os.urandom(8).hex()}")] = run
-            now = ", ".join(run.name for run in running.values()) or "no workers yet"
-            bar.set_postfix_str(f"{failed} failed; now: {now}")
+            now = f"{failed} failed; now: {', '.join(run.name for run in running.values()) or 'no workers yet'}"
+            bar.set_postfix_str(now, refresh=now != shown or sys.stderr.isatty())  # a log file gets a line for a change only
+            shown, done = now, []
             try:
-                done = wait(list(running), timeout=1, return_when="FIRST_COMPLETED").done if running else []
+                if running:
+                    done = wait(list(running), timeout=1, return_when="FIRST_COMPLETED").done
+                else:
+                    time.sleep(1)
             except TimeoutError:
-                done = []
+                pass
+            except CancelledError:
+                raise InputError(_GONE) from None
             for future in done:
                 answer = _answer(future)
                 failed += bool(answer["error"])
@@ -343,16 +362,17 @@ def _results(client, plan: Plan, todo: list[Run]) -> Iterator[tuple[Run, dict]]:
                 bar.update()
 
 
+_GONE = "the Dask scheduler is gone; the finished runs are recorded, the same command goes on with the others"
+
+
 def _answer(future) -> dict:
     """What a run came to; a worker's failure to run it at all is an answer, too."""
-    from concurrent.futures import CancelledError
+    from distributed import CancelledError
 
-    if future.status == "cancelled":
-        raise InputError("the Dask scheduler is gone; the finished runs are recorded, the same command goes on with the others")
     try:
         return future.result()
     except CancelledError:
-        raise InputError("the Dask scheduler is gone; the finished runs are recorded, the same command goes on with the others") from None
+        raise InputError(_GONE) from None
     except Exception as error:
         return {"error": f"{type(error).__name__}: {(str(error).strip() or 'no message').splitlines()[0]}", "text": ""}
 

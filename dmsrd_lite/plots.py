@@ -137,6 +137,22 @@ def plot_decisions(records, floor: np.ndarray, ax=None):
     return ax
 
 
+def plot_stream(records, floor: np.ndarray, ax=None):
+    """KL at arrival of what explains each demonstration of a long stream (``lifelong`` records), by the branch taken."""
+    ax = ax or plt.gca()
+    styles = {"mixture": ("o", "#0072B2"), "mixture, better than a new strategy": ("D", "#009E73"), "new strategy": ("X", "#D55E00")}
+    x, branches = np.arange(len(records)), np.array([r["branch"] for r in records])
+    kl = np.array([r["kl_new"] if r["branch"] == "new strategy" else r["kl_mix"] for r in records])
+    for branch, (marker, color) in styles.items():
+        some = branches == branch
+        ax.plot(x[some], kl[some], marker, color=color, label=f"{branch} ({some.sum()})", linestyle="none", markersize=4)
+    ax.hlines(floor, x - 0.4, x + 0.4, color="black", label="floor")
+    ax.plot(x, [r["threshold"] for r in records], color="#7A7A7A", label="threshold", linewidth=0.8)
+    ax.set(ylabel="KL (nats)")
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5, fontsize=8)
+    return ax
+
+
 def plot_correlation(trajectory_rewards: np.ndarray, returns: np.ndarray, ax=None, every: int = 1):
     """Learned mean reward of test trajectories over their true return, one dot each."""
     ax = ax or plt.gca()

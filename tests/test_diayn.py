@@ -3,19 +3,24 @@ import json
 
 import numpy as np
 import pytest
+from test_mixture import balancers
 
-from dmsrd_lite.demonstrations import load_demonstrations, load_test_set
+from dmsrd_lite import diayn
+from dmsrd_lite.demonstrations import demonstrations_from, load_demonstrations, load_test_set
 from dmsrd_lite.diayn import (
     DiaynSettings,
     StrategyDiscriminator,
     distances,
+    draw_mixtures,
+    farthest_from_mixtures,
     generate_demonstrations,
+    generate_lifelong,
     generate_test_set,
     good_flights,
     most_distinct,
     visible_distance,
 )
-from dmsrd_lite.envs import DOMAINS, LUNAR_LANDER, InputError
+from dmsrd_lite.envs import DOMAINS, INVERTED_PENDULUM, LUNAR_LANDER, InputError
 from dmsrd_lite.metrics import policy_divergences
 from dmsrd_lite.networks import GaussianPolicies
 from dmsrd_lite.policy_optimization import TrainingSettings
@@ -109,3 +114,46 @@ def test_distances_with_matched_starts_are_above_ones_own(lander_set):
         by_hand = policy_divergences(actor, lander_set.select([i]), [0, i], n_rollouts=2)
         assert own[i] == by_hand[i]
         assert table[i].tolist() == (by_hand - by_hand[i]).tolist()
+
+
+def test_a_stream_holds_base_users_and_mixtures_of_them(domain, tmp_path, monkeypatch):
+    easy = dataclasses.replace(domain, success_return=-1e9, failed=lambda s, r: np.zeros(r.shape, bool), horizon=60, kl_threshold=1e9)
+    monkeypatch.setitem(DOMAINS, domain.name, easy)
+    monkeypatch.setattr(diayn, "farthest_from_mixtures", lambda actor, shown, n, seed: ([2, 0], np.full(2, 2.0), np.zeros(4)))
+    choice = generate_lifelong(easy, 0, tmp_path, settings=TINY, n_base=2, n_mixtures=5)
+    shown = load_demonstrations(tmp_path / "inverted_pendulum_lifelong.npz")
+    assert shown.actions.shape == (7, 3, 60, 1)
+    weights = np.array(shown.metadata["weights"])
+    assert weights[:2].tolist() == [[1, 0], [0, 1]]
+    assert weights.sum(1) == pytest.approx(np.ones(7), abs=1e-3)
+    assert len(shown.metadata["floor"]) == len(shown.metadata["returns"]) == 7
+    assert shown.metadata["returns"] == pytest.approx(-np.abs(shown.observations[:, :, 1:, 1]).sum(-1).mean(1), abs=1e-3)
+    assert shown.metadata["choice"] == json.loads(json.dumps(choice))
+    assert choice["kept"] == [2, 0]
+    assert shown.strategy_labels is None, "who is who stands in the metadata alone"
+
+
+def test_mixtures_act_by_their_weights_and_bad_ones_are_redrawn(domain):
+    """From places 0.4 m left and right; whoever stays left of the middle is redrawn, by a return that says so."""
+    actor = balancers([-0.4, 0.4], sigma=0.02)
+    easy = dataclasses.replace(domain, success_return=-1e9, horizon=200)
+    actor.domain = easy
+    weights, takes, n_redrawn = draw_mixtures(easy, actor, TINY, 0, 4, -1e9)
+    assert (len(weights), n_redrawn) == (4, 0)
+    last = takes[0].observations[:, :, -1, 0].mean(1)
+    assert last == pytest.approx(weights @ [-0.4, 0.4], abs=0.15)
+    bound = float(np.median(takes[0].returns.mean(1)))
+    again, takes, n_redrawn = draw_mixtures(easy, actor, TINY, 0, 4, bound)
+    assert n_redrawn >= 1
+    assert len(again) == 4
+    assert takes[0].returns.mean(1).min() >= bound
+
+
+def test_farthest_from_mixtures_finds_the_corners():
+    """Five who balance in five places: everybody between the outermost two is a mixture of them."""
+    actor = balancers([-0.2, 0.6, 0.0, -0.6, 0.3], sigma=0.05)
+    data = rollout(INVERTED_PENDULUM, actor, 3, 1)
+    kept, far, own = farthest_from_mixtures(actor, demonstrations_from(data, actor), 2, [0])
+    assert sorted(kept) == [1, 3]
+    assert far.min() > 5
+    assert len(own) == 5

@@ -1,5 +1,9 @@
 import dataclasses
 import json
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -515,3 +519,97 @@ def test_on_the_lander_the_clone_calibrates_the_threshold(lander_set, warm_start
     assert len(made) == (1 if warm_start else 2), "the clone that AIRL starts from is the one that calibrates"
     assert record["reference"] == metrics.policy_divergences(clone, first, [0, 102, 0, 7])[0]
     assert record["threshold"] == record["reference"] + settings.kl_margin
+
+
+def test_a_round_works_on_a_bounded_sample_and_measures_no_more(three, states, monkeypatch):
+    """Pure ones, the newest, and so many of the others, drawn anew each time; a sample of all is the same as no bound."""
+    four = three.select([2, 2, 2, 2])
+    settings, rounds = dataclasses.replace(GENEROUS, remembered=1), []
+    learner = DMSRD(INVERTED_PENDULUM, settings, 0, 1, states[2])
+    watch(monkeypatch, "MSRD", rounds)
+    records = list(learner.learn(four))
+    assert [len(r["remembered"]) for r in records] == [3, 4, 4, 4]
+    for r, made in zip(records, rounds, strict=True):
+        n = r["demonstration"]
+        assert {0, 1, n} <= set(r["remembered"]) <= set(range(n + 1))
+        assert len(r["kl_before_round"]) == len(r["kl_after_round"]) == len(r["remembered"])
+        known, weights, pure = made["between"]
+        assert np.array_equal(known.observations, learner.state.demonstrations.select(r["remembered"]).observations)
+        assert np.array_equal(weights, learner.state.weights[r["remembered"]])
+        assert list(np.array(r["remembered"])[pure]) == list(learner.state.pure)
+    assert_same(
+        after(states[2], three.select([2]), dataclasses.replace(GENEROUS, remembered=5)), after(states[2], three.select([2]), GENEROUS)
+    )
+
+
+def test_an_audit_measures_everybody(three, states):
+    learner = DMSRD(INVERTED_PENDULUM, dataclasses.replace(GENEROUS, remembered=1, audit_every=2), 0, 1, states[2])
+    records = list(learner.learn(three.select([2, 2])))
+    assert "audit" not in records[0]
+    audit = records[1]["audit"]
+    assert len(audit["kl"]) == 4
+    means = learner.rewards().evaluate(learner.state.demonstrations.observations).mean((2, 3))
+    assert audit["recognized"] == lifelong.recognized(means, learner.state.pure).tolist()
+
+
+STREAM = """
+import sys
+sys.path.insert(0, {tests!r})
+from test_lifelong import GENEROUS, three_users
+from dmsrd_lite.lifelong import DMSRD, learn_stream
+from dmsrd_lite.envs import INVERTED_PENDULUM
+learner = DMSRD(INVERTED_PENDULUM, GENEROUS, 0, 1)
+for record in learn_stream(learner, three_users(), sys.argv[1]):
+    print(record["demonstration"], flush=True)
+"""
+
+
+def three_users():
+    shown = shown_by(balancers([-0.4, 0.4, 0.0]), 50)
+    return shown.select([0, 1, 2, 1, 0, 2, 1, 2])
+
+
+def newest(folder):
+    states = [load_state(path, INVERTED_PENDULUM) for path in folder.glob("checkpoint_*.safetensors")]
+    return max(states, key=lambda s: len(s.records))
+
+
+def test_killed_at_random_moments_a_stream_ends_with_the_same_bits(tmp_path):
+    script, rng = STREAM.format(tests=str(Path(__file__).parent)), np.random.default_rng(0)
+    whole = DMSRD(INVERTED_PENDULUM, GENEROUS, 0, 1)
+    assert len(list(lifelong.learn_stream(whole, three_users(), tmp_path / "whole"))) == 8
+    command, folder, done = [sys.executable, "-c", script, str(tmp_path / "killed")], tmp_path / "killed", 0
+    for at in sorted(rng.choice(np.arange(1, 7), 3, replace=False)):
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        for line in process.stdout:
+            if int(line) >= at:
+                break
+        time.sleep(rng.uniform(0, 0.3))
+        process.kill()
+        process.communicate()
+        assert len(newest(folder).records) >= max(done, at)
+        done = len(newest(folder).records)
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert [int(line) for line in ended.stdout.split()] == list(range(8))
+    assert_same(newest(folder), whole.state)
+
+
+def test_a_spoiled_checkpoint_is_refused_in_a_sentence_and_the_one_before_it_is_used(three, tmp_path):
+    whole = DMSRD(INVERTED_PENDULUM, GENEROUS, 0, 1)
+    list(lifelong.learn_stream(whole, three, tmp_path))
+    last = tmp_path / "checkpoint_1.safetensors"
+    content = last.read_bytes()
+    last.write_bytes(content[:-100])
+    again = DMSRD(INVERTED_PENDULUM, GENEROUS, 0, 1)
+    with pytest.warns(UserWarning, match=r"checkpoint_1\.safetensors: cannot be read .*; going on from the checkpoint before it"):
+        assert len(list(lifelong.learn_stream(again, three, tmp_path))) == 3
+    assert_same(again.state, whole.state)
+    assert load_state(last, INVERTED_PENDULUM).records
+
+
+def test_a_folder_of_another_stream_is_refused(three, tmp_path):
+    list(lifelong.learn_stream(DMSRD(INVERTED_PENDULUM, GENEROUS, 0, 1), three.select([0]), tmp_path))
+    with pytest.raises(InputError, match="another seed or other settings"):
+        list(lifelong.learn_stream(DMSRD(INVERTED_PENDULUM, GENEROUS, 1, 1), three, tmp_path))
+    with pytest.raises(InputError, match="of other demonstrations"):
+        list(lifelong.learn_stream(DMSRD(INVERTED_PENDULUM, GENEROUS, 0, 1), three.select([1]), tmp_path))

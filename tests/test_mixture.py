@@ -3,10 +3,10 @@ import pytest
 from scipy.stats import kstest, norm
 
 from dmsrd_lite import mixture
-from dmsrd_lite.demonstrations import DemonstrationSet
+from dmsrd_lite.demonstrations import DemonstrationSet, demonstrations_from
 from dmsrd_lite.envs import INVERTED_PENDULUM, InputError
 from dmsrd_lite.metrics import policy_divergences
-from dmsrd_lite.mixture import Mixtures, MixtureSettings, check_weights, search_mixture
+from dmsrd_lite.mixture import Mixtures, MixtureSettings, check_weights, regress_weights, search_mixture
 from dmsrd_lite.networks import Actor, GaussianPolicies
 from dmsrd_lite.rollouts import rollout
 
@@ -205,3 +205,35 @@ def test_no_strategies_and_several_demonstrations_are_refused():
 def test_rounding_is_forgiven():
     table = check_weights([1 + 1e-10, -1e-10], 2)
     assert table.min() == 0
+
+
+def test_regressed_weights_are_the_least_squares_on_the_simplex(actor):
+    """Against SciPy's general minimiser, and exact where the demonstration is a noiseless mixture."""
+    from scipy.optimize import minimize
+
+    true = np.array([0.2, 0.5, 0.3])
+    quiet = Mixtures(actor.select(range(3), 1e-6), [true])
+    exact = demonstrations_from(rollout(INVERTED_PENDULUM, quiet, 2, 0, horizon=60), quiet)
+    assert regress_weights(actor, exact) == pytest.approx(true, abs=0.02)
+    noisy = shown_by(balancers([-0.1]), 60)
+    found = regress_weights(actor, noisy)
+    means = actor.mean(noisy.observations[0, :, :60].reshape(1, -1, 4))[..., 0]
+    wanted = noisy.actions[0].ravel()
+    best = minimize(lambda w: np.square(wanted - w @ means).mean(), np.ones(3) / 3, bounds=[(0, 1)] * 3, tol=1e-12,
+                    constraints={"type": "eq", "fun": lambda w: w.sum() - 1})  # fmt: skip
+    error = [np.square(wanted - w @ means).mean() for w in (found, best.x)]
+    assert error[0] <= error[1] + 1e-6
+    assert found.sum() == pytest.approx(1)
+    assert found.min() >= 0
+
+
+def test_near_regressed_weights_save_the_search():
+    actor = balancers([-0.4, 0.4])
+    shown = shown_by(balancers([0.4]), 60)
+    settings = MixtureSettings(4, 2, search_rollouts=1, n_finalists=2, final_rollouts=2, regression=True)
+    near = search_mixture(actor, shown, settings, 0, enough=1e9)
+    assert (len(near.candidates), near.steps) == (1, 2 * 60)
+    assert np.array_equal(near.weights, regress_weights(actor, shown))
+    far = search_mixture(actor, shown, settings, 0, enough=-1e9)
+    assert far.steps > near.steps
+    assert any(np.array_equal(row, near.weights) for row in far.candidates), "it is a candidate all the same"

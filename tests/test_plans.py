@@ -265,7 +265,12 @@ def test_a_full_output_folder_is_one_sentence_and_leaves_no_half_record(tmp_path
     assert not list(output.glob("*"))
 
 
-SLOW = "import time\ntime.sleep(0.3)\nfrom dmsrd_lite import runs\nruns.hand_over(square=seed**2)"
+SLOW = """
+import time
+from IPython.display import publish_display_data
+time.sleep(0.3)
+publish_display_data({"application/vnd.dmsrd-lite.result+json": {"square": seed**2}})  # as hand_over, without loading torch
+"""
 
 
 def test_workers_killed_twice_and_all_twenty_runs_are_recorded(tmp_path, monkeypatch):
@@ -365,3 +370,18 @@ def test_a_grid_of_paths_gets_file_names(tmp_path):
     assert all("/" not in n for n in names)
     with pytest.raises(InputError, match="path = 3: expected text"):
         plans.load_plan(write_plan(tmp_path, "[grid]\npath = [3]")[0])
+
+
+def test_a_scheduler_that_dies_is_one_sentence(tmp_path):
+    plan, output = write_plan(tmp_path, "[grid]\nseed = [0, 1, 2]", ["import time\ntime.sleep(3)"])
+    with hand_started_cluster(1) as address:
+        driver = start(plan, output, "--scheduler", address)
+        wait_for(lambda: list(output.glob("*.json")))
+        for process in psutil.Process().children():
+            if "scheduler" in process.cmdline():
+                process.kill()
+        printed, _ = driver.communicate(timeout=90)
+    assert driver.returncode == 2
+    assert "the Dask scheduler is gone; the finished runs are recorded" in printed
+    assert "Traceback" not in printed
+    assert records_of(output)["tiny__seed-0"]["error"] == ""

@@ -7,9 +7,9 @@ import pytest
 from dmsrd_lite import plots
 
 RECORDS = [
-    {"kl_mix": None, "kl_new": 0.5, "threshold": 1.0, "n_strategies": 1},
-    {"kl_mix": 0.8, "kl_new": None, "threshold": 1.1, "n_strategies": 1},
-    {"kl_mix": 3.0, "kl_new": 0.4, "threshold": 0.9, "n_strategies": 2},
+    {"branch": "new strategy", "kl_mix": None, "kl_new": 0.5, "threshold": 1.0, "n_strategies": 1},
+    {"branch": "mixture", "kl_mix": 0.8, "kl_new": None, "threshold": 1.1, "n_strategies": 1},
+    {"branch": "new strategy", "kl_mix": 3.0, "kl_new": 0.4, "threshold": 0.9, "n_strategies": 2},
 ]
 
 
@@ -29,6 +29,16 @@ def test_decisions_show_what_was_measured():
     assert lines["new policy"] == pytest.approx([0.5, np.nan, 0.4], nan_ok=True)
     assert lines["threshold"] == pytest.approx([1.0, 1.1, 0.9])
     assert [t.get_text() for t in ax.get_xticklabels()] == ["0\n(1)", "1\n(1)", "2\n(2)"]
+
+
+def test_a_stream_shows_what_explains_each():
+    ax = plots.plot_stream(RECORDS, np.array([0.4, 0.5, 0.6]), plt.figure().subplots())
+    points = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in ax.lines}
+    taken = [r["branch"] for r in RECORDS]
+    for branch in set(taken):
+        at = [i for i, b in enumerate(taken) if b == branch]
+        values = [RECORDS[i]["kl_new" if branch == "new strategy" else "kl_mix"] for i in at]
+        assert points[f"{branch} ({len(at)})"] == (at, values)
 
 
 def test_a_slider_draws_once_where_nobody_can_move_it(monkeypatch):
