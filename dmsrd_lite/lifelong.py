@@ -298,18 +298,19 @@ def load_state(path, domain: Domain) -> LifelongState:
     )
 
 
-def learn_stream(learner: DMSRD, shown: DemonstrationSet, folder) -> Iterator[dict]:
+def learn_stream(learner: DMSRD, shown: DemonstrationSet, folder, source: str = "") -> Iterator[dict]:
     """``learner.learn`` with a checkpoint in ``folder`` after every demonstration; goes on from the newest one that can be read.
 
     Killed at any moment and called again with the same arguments, it redoes at most the demonstration that was in flight and
     ends with the bits of an uninterrupted run. Two files take turns: one that was spoiled costs one demonstration. Yields the
-    records of all demonstrations, those of earlier calls first. ``InputError`` when the folder holds another stream.
+    records of all demonstrations, those of earlier calls first. ``InputError`` when the folder holds another stream, or one of
+    another ``source`` (of the code: ``plans.package_hash``).
     """
     folder, states = Path(folder).resolve(), [learner.state]
     check_folder(folder / "any")
-    made_with, note = repr((learner.domain.name, learner.state.seed, learner.settings)), folder / "settings.txt"
+    made_with, note = repr((learner.domain.name, learner.state.seed, learner.settings, source)), folder / "settings.txt"
     if note.exists() and note.read_text() != made_with:
-        raise InputError(f"{folder}: holds checkpoints made with another seed or other settings; expected the same, or another folder")
+        raise InputError(f"{folder}: holds checkpoints of another seed, other settings or other code; expected the same, or another folder")
     write_atomically(note, lambda file: file.write(made_with.encode()))
     for path in sorted(folder.glob("checkpoint_*.safetensors")):
         try:

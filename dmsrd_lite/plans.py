@@ -1,6 +1,7 @@
 """Plans: one notebook, or several, with many parameters; every run recorded; a second call does what is left."""
 
 import ast
+import fcntl
 import hashlib
 import itertools
 import json
@@ -8,6 +9,7 @@ import os
 import re
 import sys
 import tempfile
+import threading
 import time
 import tomllib
 from collections import deque
@@ -24,6 +26,7 @@ PACKAGE = Path(__file__).resolve().parent
 LEFT_OUT = ("plots", "runs", "plans", "__main__", "__init__")  # of the source hash: they decide no number
 _CHECKS = {"preset": check_preset, "domain": get_domain, "seed": check_seed}
 _NUMBER = (int, float)
+_TAKEN = ("plans", "records", "gallery", "checkpoints")  # folders beside the plans' own
 _KEYS = {"name": str, "notebook": (str, list), "minutes": _NUMBER, "tags": list, "cell_minutes": _NUMBER, "parameters": dict, "grid": dict}
 _WORDS = {str: "text", int: "a whole number", float: "a number", list: "a list", dict: "a table", bool: "true or false"}
 
@@ -33,7 +36,8 @@ class Run:
     """One notebook with all of its parameters; ``name`` is that of its files."""
 
     name: str
-    notebook: Path
+    notebook: str
+    text: str  # of the notebook, as it was when the plan was read
     parameters: dict  # every parameter of the notebook, defaults included
     source: str  # ``source_hash``
 
@@ -55,7 +59,8 @@ def source_hash(notebook) -> str:
     """
     from IPython.core.inputtransformer2 import TransformerManager
 
-    cells = [TransformerManager().transform_cell(c.source) for c in notebook.cells if c.cell_type == "code"]
+    plain_cells = [re.sub(r"\A\s*%%\w.*\n", "", c.source) for c in notebook.cells if c.cell_type == "code"]  # %%time hides its cell
+    cells = [TransformerManager().transform_cell(source) for source in plain_cells]
     trees, waiting = {"": ast.parse("\n".join(cells))}, [""]
     while waiting:
         for name in _imported(trees[waiting.pop()]) - {*trees, *LEFT_OUT}:
@@ -64,6 +69,13 @@ def source_hash(notebook) -> str:
                 waiting.append(name)
     text = "\n".join(f"{name}: {ast.dump(_without_docstrings(tree))}" for name, tree in sorted(trees.items()))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def package_hash(*modules: str) -> str:
+    """``source_hash`` of package modules and of all that they import."""
+    from nbformat.v4 import new_code_cell, new_notebook
+
+    return source_hash(new_notebook(cells=[new_code_cell(f"from dmsrd_lite import {', '.join(modules)}")]))
 
 
 def _imported(tree: ast.AST) -> set[str]:
@@ -97,13 +109,20 @@ def load_plan(path, folder=None) -> Plan:
     faults = [f"unknown key {k!r}: expected some of {', '.join(_KEYS)}" for k in raw if k not in _KEYS]
     faults += [f"{k} = {raw[k]!r}: expected {_type_names(t)}" for k, t in _KEYS.items() if k in raw and not _is_a(raw[k], t)]
     faults += [f"{k} is missing" for k in ("name", "notebook") if k not in raw]
-    if not faults and not re.fullmatch(r"[\w.-]+", raw["name"]):
-        faults.append(f"name = {raw['name']!r}: expected letters, digits, '_', '-' and '.'")
+    if isinstance(raw.get("name"), str) and (not re.fullmatch(r"\w[\w.-]*", raw["name"], re.ASCII) or raw["name"] in _TAKEN):
+        faults.append(f"name = {raw['name']!r}: expected letters, digits, '_', '-' and '.', and none of {', '.join(_TAKEN)}")
+    for k in ("minutes", "cell_minutes"):
+        if _is_a(raw.get(k), _NUMBER) and not 0 < raw[k] < float("inf"):
+            faults.append(f"{k} = {raw[k]!r}: expected a number above 0")
+    if not all(isinstance(tag, str) for tag in raw.get("tags", ()) if isinstance(raw["tags"], list)):
+        faults.append(f"tags = {raw['tags']!r}: expected a list of texts")
     fixed, grid = raw.get("parameters", {}), raw.get("grid", {})
     if not faults:
         faults += [f"grid: {k} = {v!r}: expected a list of at least one value" for k, v in grid.items() if not isinstance(v, list) or not v]
         faults += [f"{k} stands in both parameters and grid: expected it in one of them" for k in fixed if k in grid]
     runs = [] if faults else _expand(raw["notebook"], path.parent, fixed, grid, faults)
+    if not runs and not faults:
+        faults.append(f"notebook = {raw['notebook']!r}: expected at least one")
     if faults:
         raise InputError(f"{path}: " + "; ".join(faults))
     folder = Path(folder).resolve() if folder else ROOT / "papermill_runs" / raw["name"]
@@ -117,12 +136,20 @@ def _expand(notebooks, beside: Path, fixed: dict, grid: dict, faults: list[str])
 
     runs = []
     for pattern in [notebooks] if isinstance(notebooks, str) else notebooks:
-        found = sorted(NOTEBOOKS.glob(f"{pattern}.ipynb")) or sorted(beside.glob(pattern))
+        try:
+            given = beside / pattern  # an absolute path stays as it is
+            found = sorted(NOTEBOOKS.glob(f"{pattern}.ipynb")) or ([given] if given.is_file() else sorted(beside.glob(pattern)))
+        except (NotImplementedError, ValueError, TypeError):
+            found = [given] if isinstance(pattern, str) and given.is_file() else []
         if not found:
             faults.append(f"notebook {pattern!r}: expected the name of a lesson, or a path from the plan's folder")
         for notebook in found:
             try:
-                own, source = _own_parameters(notebook), source_hash(nbformat.read(notebook, 4))
+                text = notebook.read_text()
+                own, source = _own_parameters(notebook), source_hash(nbformat.reads(text, 4))
+            except InputError as error:
+                faults.append(str(error))
+                continue
             except Exception as error:  # nbformat, papermill and ast each have errors of their own
                 faults.append(f"{notebook.name}: cannot be read ({type(error).__name__}: {error}); expected a notebook")
                 continue
@@ -130,9 +157,9 @@ def _expand(notebooks, beside: Path, fixed: dict, grid: dict, faults: list[str])
             new = [fault for k, values in used.items() for v in values if (fault := _fault(notebook.stem, own, k, v))]
             faults += [fault for fault in new if fault not in faults]
             for values in itertools.product(*grid.values()) if not new else ():
-                chosen = dict(zip(grid, values, strict=True))
-                parameters = json.loads(json.dumps({**own, **fixed, **chosen}))
-                runs.append(Run(_run_name(notebook.stem, chosen), notebook, parameters, source))
+                chosen = dict(sorted(zip(grid, values, strict=True)))
+                parameters = {k: float(v) if isinstance(own[k], float) else v for k, v in {**own, **fixed, **chosen}.items()}
+                runs.append(Run(_run_name(notebook.stem, chosen), notebook.stem, text, parameters, source))
     names = [run.name for run in runs]
     faults += [f"{name} stands in the plan twice: expected every run once" for name in sorted({n for n in names if names.count(n) > 1})]
     return runs
@@ -142,7 +169,26 @@ def _own_parameters(notebook: Path) -> dict:
     """The parameters of a notebook and their defaults."""
     from papermill import inspect_notebook
 
-    return {name: ast.literal_eval(p["default"]) for name, p in inspect_notebook(str(notebook)).items()}
+    found = {}
+    for name, p in inspect_notebook(str(notebook)).items():
+        try:
+            found[name] = ast.literal_eval(p["default"])
+        except (ValueError, SyntaxError):
+            found[name] = ...
+        if not _is_plain(found[name]):
+            raise InputError(f"{notebook.name}: parameter {name} = {p['default']}: expected {_PLAIN} as its default")
+    return found
+
+
+_PLAIN = "a finite number, text, true or false, or a list of them"
+
+
+def _is_plain(value) -> bool:
+    """Does JSON give it back as it is? (No dates, no tuples, no NaN.)"""
+    try:
+        return json.loads(json.dumps(value, allow_nan=False)) == value and not isinstance(value, tuple | type(None))
+    except (TypeError, ValueError):
+        return False
 
 
 def _is_a(value, kind) -> bool:
@@ -160,6 +206,8 @@ def _fault(notebook: str, own: dict, name: str, value) -> str:
     kind = type(own[name])
     if not _is_a(value, (int, float) if kind is float else kind):
         return f"{notebook}: {name} = {value!r}: expected {_type_names(kind)}, like its default {own[name]!r}"
+    if not _is_plain(value):
+        return f"{notebook}: {name} = {value!r}: expected {_PLAIN}"
     try:
         _CHECKS.get(name, str)(value)
     except InputError as error:
@@ -170,7 +218,7 @@ def _fault(notebook: str, own: dict, name: str, value) -> str:
 def _run_name(stem: str, chosen: dict) -> str:
     """File name of a run; values that do not fit into one are cut and marked by a hash."""
     full = "__".join([stem, *(f"{k}-{v}" for k, v in chosen.items())])
-    short = re.sub(r"[^\w.=-]", "-", full)[:120]
+    short = re.sub(r"[^\w.=-]", "-", full, flags=re.ASCII)[:120]
     return short if short == full else f"{short}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
 
 
@@ -178,7 +226,8 @@ def read_record(path) -> dict:
     """The record of one run; ``InputError`` when it is cut short or not a record."""
     try:
         record = json.loads(Path(path).read_text())
-        if not {"run", "parameters", "source", "metrics", "error"} <= set(record):
+        fits = isinstance(record, dict) and {"run", "source", "metrics", "error"} <= set(record)
+        if not fits or not isinstance(record.get("parameters"), dict) or not isinstance(record.get("seconds"), int | float | None):
             raise ValueError("not a record")
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path}: cannot be read as the record of a run ({error}); it is made anew when the plan runs") from None
@@ -204,8 +253,11 @@ def read_table(folder):
 def why(run: Run, folder: Path) -> str:
     """Why a run is to be done: "" when it is finished, recorded, of this source and with these parameters."""
     path = folder / f"{run.name}.json"
-    if not path.exists():
-        return "new"
+    try:
+        if not path.exists():
+            return "new"
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a readable folder") from None
     try:
         record = read_record(path)
     except InputError as error:
@@ -220,20 +272,29 @@ def why(run: Run, folder: Path) -> str:
     return "" if path.with_suffix(".ipynb").exists() else "its executed notebook is gone"
 
 
+_one_at_a_time = threading.Lock()
+
+
 def run_text(text: str, name: str, parameters: dict, source: str, cell_seconds: float, folder: str) -> dict:
     """Execute the text of a notebook where this is called; returns the executed text and the record's machine part."""
     import nbformat
 
     here = source_hash(nbformat.reads(text, 4))
     if here != source:
-        return {"error": f"this worker has another dmsrd_lite ({here}); expected the caller's ({source})", "text": ""}
+        return {"error": f"the package here is another ({here}) than when the plan was read ({source}); expected the same", "text": ""}
     os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # Dask sets it to save memory; a kernel that inherits it takes 1.7 times as long
     with tempfile.TemporaryDirectory(prefix="dmsrd_lite_") as scratch:
         given, executed = Path(scratch) / f"{name}.ipynb", Path(scratch) / "executed.ipynb"
         given.write_text(text)
-        error, seconds = execute(given, executed, parameters, Path(folder) if Path(folder).is_dir() else ROOT, cell_seconds)
+        with _one_at_a_time:  # papermill changes the working directory
+            error, seconds = execute(given, executed, parameters, Path(folder) if Path(folder).is_dir() else ROOT, cell_seconds)
+        if not error and source_hash(nbformat.reads(text, 4)) != source:
+            error = "the package changed while this ran; expected it to stay"
         text = executed.read_text() if executed.exists() else ""
-    results = handed_over(nbformat.reads(text, 4)) if text else {}
+    try:
+        results = handed_over(nbformat.reads(text, 4)) if text else {}
+    except Exception:  # cut short, as by a full disk
+        results, text, error = {}, "", error or "the executed notebook cannot be read"
     return {
         "versions": versions(),
         "machine": machine(),
@@ -269,7 +330,7 @@ def _cluster(workers: int, scheduler: str) -> Iterator:
     if scheduler:
         try:
             client = Client(scheduler, timeout=10)
-        except (OSError, ValueError, ImportError) as error:  # ImportError: an unknown protocol
+        except Exception as error:  # unknown protocols, missing certificates, answers of something else: each has its own
             raise InputError(
                 f"{scheduler}: no Dask scheduler answers ({type(error).__name__}); expected one like tcp://host:8786"
             ) from None
@@ -284,9 +345,12 @@ def _cluster(workers: int, scheduler: str) -> Iterator:
             "local_directory": scratch,
             "silence_logs": logging.CRITICAL,
         }
-        with LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **local) as cluster:
-            with Client(cluster) as client:
-                yield client
+        try:
+            cluster = LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **local)
+        except Exception as error:
+            raise InputError(f"{workers} workers cannot be started here ({type(error).__name__}); expected fewer, or more memory") from None
+        with cluster, Client(cluster) as client:
+            yield client
 
 
 def default_workers() -> int:
@@ -307,27 +371,46 @@ def run_plan(plan: Plan, *, workers: int = 0, scheduler: str = "", only=(), forc
     if dry_run:
         return True
     check_folder(plan.folder / "any")
-    if todo:
-        with _cluster(workers or default_workers(), scheduler) as client:
-            for run, answer in _results(client, plan, todo):
-                _record(plan, run, answer)
-    return _summary(plan, chosen)
+    with _locked(plan.folder):
+        if todo:
+            with _cluster(min(workers or default_workers(), len(todo)), scheduler) as client:
+                for run, answer in _results(client, plan, todo):
+                    _record(plan, run, answer)
+        return _summary(plan, chosen)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator:
+    """One driver at a time; the lock ends with the process, however that ends."""
+    with open(folder / ".lock", "a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{folder}: another run of this plan is under way; expected one at a time") from None
+        yield
 
 
 def _selected(plan: Plan, only) -> list[Run]:
     """The runs that have all of the ``name=value`` pairs; ``notebook`` counts as a name."""
+
+    def fits(run: Run, name: str, value: str) -> bool:
+        known = {**run.parameters, "notebook": run.notebook}.get(name)
+        try:
+            return value == known if isinstance(known, str) else known is not None and json.loads(value.lower()) == known
+        except ValueError:
+            return False
+
     chosen = list(plan.runs)
     for pair in only:
-        name, _, value = pair.partition("=")
-        kept = [run for run in chosen if str({**run.parameters, "notebook": run.notebook.stem}.get(name)) == value]
-        if not kept:
-            raise InputError(f"--only {pair}: no run of the plan {plan.name} has it; expected name=value, a parameter or notebook=NAME")
-        chosen = kept
+        name, sign, value = pair.partition("=")
+        chosen = [run for run in chosen if sign and fits(run, name, value)]
+        if not chosen:
+            raise InputError(f"--only {pair}: leaves no run of the plan {plan.name}; expected name=value, a parameter's or notebook=NAME")
     return chosen
 
 
 def _results(client, plan: Plan, todo: list[Run]) -> Iterator[tuple[Run, dict]]:
-    """Each run and its answer as they come; no more runs are under way than the cluster has threads."""
+    """Each run and its answer as they come; no more runs are under way than the cluster has workers."""
     from distributed import CancelledError, wait
     from tqdm import tqdm
 
@@ -335,13 +418,13 @@ def _results(client, plan: Plan, todo: list[Run]) -> Iterator[tuple[Run, dict]]:
     with tqdm(total=len(todo), unit="run", smoothing=0, dynamic_ncols=True) as bar:
         while waiting or running:
             try:
-                threads = sum(client.nthreads().values())
+                n_workers = len(client.nthreads())  # one run at a time on each worker
             except (OSError, TimeoutError):
                 raise InputError(_GONE) from None
-            while waiting and len(running) < threads:
+            while waiting and len(running) < n_workers:
                 run = waiting.popleft()
                 limit = plan.cell_seconds or CELL_LIMITS.get(run.parameters.get("preset"), CELL_LIMITS["full"])
-                task = (run.notebook.read_text(), run.name, run.parameters, run.source, limit, str(Path.cwd()))
+                task = (run.text, run.name, run.parameters, run.source, limit, str(Path.cwd()))
                 running[client.submit(run_text, *task, key=f"{run.name}-{os.urandom(8).hex()}")] = run
             now = f"{failed} failed; now: {', '.join(run.name for run in running.values()) or 'no workers yet'}"
             bar.set_postfix_str(now, refresh=now != shown or sys.stderr.isatty())  # a log file gets a line for a change only
@@ -380,9 +463,10 @@ def _answer(future) -> dict:
 def _record(plan: Plan, run: Run, answer: dict) -> None:
     """Write a run's executed notebook and then its record, each whole or not at all."""
     text = answer.pop("text")
+    (plan.folder / f"{run.name}.ipynb").unlink(missing_ok=True)
     if text:
         write_atomically(plan.folder / f"{run.name}.ipynb", lambda file: file.write(text.encode()))
-    made_by = {"run": run.name, "plan": plan.name, "tags": plan.tags, "notebook": run.notebook.stem}
+    made_by = {"run": run.name, "plan": plan.name, "tags": plan.tags, "notebook": run.notebook}
     used = {"parameters": run.parameters, "seed": run.parameters.get("seed"), "source": run.source}
     record = {**made_by, **used, "seconds": None, "environment_steps": None, "metrics": {}, **answer}
     content = json.dumps(plain(record), indent=1) + "\n"

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 import os
 import platform
 import re
@@ -123,10 +124,10 @@ def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT, cel
             progress_bar=False,
             kernel_name="python3",
             cwd=str(folder),
-            execution_timeout=int(cell_seconds or CELL_LIMITS.get(parameters.get("preset"), CELL_LIMITS["full"])),
+            execution_timeout=math.ceil(cell_seconds or CELL_LIMITS.get(parameters.get("preset"), CELL_LIMITS["full"])),
         )
     except PapermillExecutionError as failure:
-        error = f"cell {failure.exec_count}: {failure.ename}: {failure.evalue}"
+        error = f"cell {failure.exec_count}: {failure.ename}: {(failure.evalue.splitlines() or [''])[0]}"
     except Exception as failure:  # a dead kernel or a time-out; whatever it is, the other notebooks go on
         error = f"{type(failure).__name__}: {(str(failure).strip() or 'no message').splitlines()[0]}"
     return error, time.perf_counter() - start

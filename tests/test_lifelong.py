@@ -609,7 +609,9 @@ def test_a_spoiled_checkpoint_is_refused_in_a_sentence_and_the_one_before_it_is_
 
 def test_a_folder_of_another_stream_is_refused(three, tmp_path):
     list(lifelong.learn_stream(DMSRD(INVERTED_PENDULUM, GENEROUS, 0, 1), three.select([0]), tmp_path))
-    with pytest.raises(InputError, match="another seed or other settings"):
+    with pytest.raises(InputError, match="another seed, other settings or other code"):
         list(lifelong.learn_stream(DMSRD(INVERTED_PENDULUM, GENEROUS, 1, 1), three, tmp_path))
+    with pytest.raises(InputError, match="another seed, other settings or other code"):
+        list(lifelong.learn_stream(DMSRD(INVERTED_PENDULUM, GENEROUS, 0, 1), three, tmp_path, "another source"))
     with pytest.raises(InputError, match="of other demonstrations"):
         list(lifelong.learn_stream(DMSRD(INVERTED_PENDULUM, GENEROUS, 0, 1), three.select([1]), tmp_path))

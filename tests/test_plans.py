@@ -148,7 +148,7 @@ def test_what_is_redone_and_why(tmp_path, capsys):
     write_plan(tmp_path, "[parameters]\nscale = 2.0\n[grid]\nseed = [0, 1, 2]")
     assert to_do() == {"tiny__seed-0": "another scale", "tiny__seed-1": to_do()["tiny__seed-1"], "tiny__seed-2": "new"}
     assert run(plan, output, "--only", "seed=9") == 2
-    assert "--only seed=9: no run of the plan tiny has it" in capsys.readouterr().err
+    assert "--only seed=9: leaves no run of the plan tiny" in capsys.readouterr().err
 
 
 def test_source_hash_knows_code_from_words(tmp_path, monkeypatch):
@@ -212,6 +212,10 @@ def test_a_failed_run_keeps_its_notebook_error_and_place_and_the_others_go_on(tm
         ("[grid]\nseed = [1]\n[parameters]\nseed = 1", "seed stands in both parameters and grid"),
         ("workers = 3", "unknown key 'workers'"),
         ("minutes = 'long'", "minutes = 'long': expected a whole number or a number"),
+        ("cell_minutes = -1", "cell_minutes = -1: expected a number above 0"),
+        ("tags = [2024-01-01]", "expected a list of texts"),
+        ("[parameters]\nscale = inf", "scale = inf: expected a finite number"),
+        ("[parameters]\nseed = 2024-01-01", "expected a whole number, like its default 0"),
         ("[grid", "cannot be read as a plan"),
     ],
 )
@@ -232,6 +236,10 @@ def test_all_faults_of_a_plan_come_together(tmp_path, capsys):
     plan, output = write_plan(tmp_path, notebook="absent.ipynb")
     assert run(plan, output) == 2
     assert "notebook 'absent.ipynb': expected the name of a lesson, or a path from the plan's folder" in capsys.readouterr().err
+    for notebook in ("", "**", str(tmp_path / "none.ipynb")):
+        assert run(*write_plan(tmp_path, notebook=notebook)) == 2
+        assert "expected the name of a lesson, or a path" in capsys.readouterr().err
+    assert len(plans.load_plan(write_plan(tmp_path, notebook=str(tmp_path / "tiny.ipynb"))[0]).runs) == 2, "an absolute path will do"
     assert run(tmp_path / "none.toml", output) == 2
     assert "cannot be read as a plan" in capsys.readouterr().err
 
@@ -262,7 +270,7 @@ def test_a_full_output_folder_is_one_sentence_and_leaves_no_half_record(tmp_path
     assert done.returncode == 2
     assert "cannot be written (File too large); expected room for a file" in done.stderr
     assert "Traceback" not in done.stderr
-    assert not list(output.glob("*"))
+    assert not list(output.glob("*tiny*"))
 
 
 SLOW = """
@@ -350,7 +358,7 @@ def test_three_routes_give_the_same_metrics_to_the_last_bit(tmp_path, capsys):
 def test_a_worker_with_another_package_refuses(tmp_path):
     write_notebook(tmp_path / "tiny.ipynb", BODY)
     answer = plans.run_text((tmp_path / "tiny.ipynb").read_text(), "tiny", {}, "0" * 16, 60, str(tmp_path))
-    assert "another dmsrd_lite" in answer["error"]
+    assert "than when the plan was read" in answer["error"]
     assert answer["text"] == ""
 
 
@@ -360,6 +368,30 @@ def test_shipped_plans_fit_their_notebooks(path):
     assert plan.name == path.stem
     assert plan.runs
     assert plan.minutes > 0
+
+
+def test_only_takes_values_as_they_are_written_in_the_plan(tmp_path):
+    plan = plans.load_plan(write_plan(tmp_path, '[parameters]\ndomain = "lunar_lander"\n[grid]\nscale = [1, 2.5]\nseed = [0, 1]')[0])
+    assert [r.parameters["scale"] for r in plan.runs] == [1.0, 1.0, 2.5, 2.5]
+    for pairs, n in ((["scale=1"], 2), (["scale=2.5", "seed=1"], 1), (["domain=lunar_lander"], 4), (["notebook=tiny", "seed=0"], 2)):
+        assert len(plans._selected(plan, pairs)) == n
+    for pair in ("typo=None", "seed", "seed=x", "domain=None"):
+        with pytest.raises(InputError, match=f"--only {pair}: leaves no run"):
+            plans._selected(plan, [pair])
+
+
+def test_a_default_that_cannot_be_recorded_is_named(tmp_path):
+    for text in ("2 * 3", "(1, 2)", "float('nan')", "None"):
+        write_notebook(tmp_path / "tiny.ipynb", BODY, parameters=f"size = {text}  # odd")
+        with pytest.raises(InputError, match=r"tiny\.ipynb: parameter size = .*: expected a finite number, text"):
+            plans.load_plan(write_plan(tmp_path, "")[0])
+
+
+def test_two_drivers_at_once(tmp_path):
+    plan = plans.load_plan(*write_plan(tmp_path))
+    plan.folder.mkdir()
+    with plans._locked(plan.folder), pytest.raises(InputError, match="another run of this plan is under way"):
+        plans.run_plan(plan)
 
 
 def test_a_grid_of_paths_gets_file_names(tmp_path):
