@@ -20,7 +20,7 @@ from pathlib import Path
 
 from dmsrd_lite.demonstrations import check_folder, plain, write_atomically
 from dmsrd_lite.envs import InputError, check_seed, get_domain
-from dmsrd_lite.runs import CELL_LIMITS, NOTEBOOKS, ROOT, check_preset, execute, handed_over, machine, versions
+from dmsrd_lite.runs import NOTEBOOKS, ROOT, check_preset, execute, handed_over, in_one_line, machine, versions
 
 PACKAGE = Path(__file__).resolve().parent
 LEFT_OUT = ("plots", "runs", "plans", "__main__", "__init__")  # of the source hash: they decide no number
@@ -153,7 +153,7 @@ def _expand(notebooks, beside: Path, fixed: dict, grid: dict, faults: list[str])
             except Exception as error:  # nbformat, papermill and ast each have errors of their own
                 faults.append(f"{notebook.name}: cannot be read ({type(error).__name__}: {error}); expected a notebook")
                 continue
-            used = {k: v for k, v in {**{k: [v] for k, v in fixed.items()}, **grid}.items()}
+            used = {**{k: [v] for k, v in fixed.items()}, **grid}
             new = [fault for k, values in used.items() for v in values if (fault := _fault(notebook.stem, own, k, v))]
             faults += [fault for fault in new if fault not in faults]
             for values in itertools.product(*grid.values()) if not new else ():
@@ -423,8 +423,7 @@ def _results(client, plan: Plan, todo: list[Run]) -> Iterator[tuple[Run, dict]]:
                 raise InputError(_GONE) from None
             while waiting and len(running) < n_workers:
                 run = waiting.popleft()
-                limit = plan.cell_seconds or CELL_LIMITS.get(run.parameters.get("preset"), CELL_LIMITS["full"])
-                task = (run.text, run.name, run.parameters, run.source, limit, str(Path.cwd()))
+                task = (run.text, run.name, run.parameters, run.source, plan.cell_seconds, str(Path.cwd()))
                 running[client.submit(run_text, *task, key=f"{run.name}-{os.urandom(8).hex()}")] = run
             now = f"{failed} failed; now: {', '.join(run.name for run in running.values()) or 'no workers yet'}"
             bar.set_postfix_str(now, refresh=now != shown or sys.stderr.isatty())  # a log file gets a line for a change only
@@ -457,7 +456,7 @@ def _answer(future) -> dict:
     except CancelledError:
         raise InputError(_GONE) from None
     except Exception as error:
-        return {"error": f"{type(error).__name__}: {(str(error).strip() or 'no message').splitlines()[0]}", "text": ""}
+        return {"error": in_one_line(error), "text": ""}
 
 
 def _record(plan: Plan, run: Run, answer: dict) -> None:
@@ -477,7 +476,7 @@ def _summary(plan: Plan, chosen: list[Run]) -> bool:
     """Print one line per run; True when none failed."""
     records = [read_record(plan.folder / f"{run.name}.json") for run in chosen]
     width = max(len(run.name) for run in chosen)
-    print(f"{'run':<{width}}  seconds  result", file=sys.stdout)
+    print(f"{'run':<{width}}  seconds  result")
     for record in records:
         seconds = f"{record['seconds']:7.1f}" if record.get("seconds") is not None else "      -"
         print(f"{record['run']:<{width}}  {seconds}  {'FAILED: ' + record['error'] if record['error'] else 'ok'}")

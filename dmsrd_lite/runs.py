@@ -106,6 +106,11 @@ def lessons() -> list[Path]:
     return sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))
 
 
+def in_one_line(error: Exception) -> str:
+    """The kind of an error and the first line of what it says."""
+    return f"{type(error).__name__}: {(str(error).strip() or 'no message').splitlines()[0]}"
+
+
 def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT, cell_seconds: float = 0.0) -> tuple[str, float]:
     """Run one notebook with papermill; returns ("" or the error in one line, seconds). The executed copy is kept either way.
 
@@ -129,7 +134,7 @@ def execute(path: Path, output: Path, parameters: dict, folder: Path = ROOT, cel
     except PapermillExecutionError as failure:
         error = f"cell {failure.exec_count}: {failure.ename}: {(failure.evalue.splitlines() or [''])[0]}"
     except Exception as failure:  # a dead kernel or a time-out; whatever it is, the other notebooks go on
-        error = f"{type(failure).__name__}: {(str(failure).strip() or 'no message').splitlines()[0]}"
+        error = in_one_line(failure)
     return error, time.perf_counter() - start
 
 

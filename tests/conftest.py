@@ -31,3 +31,18 @@ def small_set(domain):
 @pytest.fixture
 def lander_set():
     return untrained_set(LUNAR_LANDER)
+
+
+def assert_decisions_follow(records, n_strategies):
+    """Every recorded decision of Algorithm 1 is the one that its own numbers ask for."""
+    known = 0
+    for r in records:
+        if known and r["kl_mix"] <= r["threshold"]:
+            assert (r["branch"], r["steps"]["airl"]) == ("mixture", 0)
+        elif known and r["kl_mix"] < r["kl_new"]:
+            assert r["branch"] == "mixture, better than a new strategy"
+        else:
+            assert r["branch"] == "new strategy"
+            known += 1
+        assert r["n_strategies"] == known
+    assert known == n_strategies
