@@ -31,7 +31,7 @@ class LifelongSettings:
     msrd: MSRDSettings = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=24)  # one round after each demonstration
     mixture: MixtureSettings = MixtureSettings()
     task_after_mixture: bool = True  # R_Task learns in the round after a mixture, too (the paper), or only with new strategies
-    remembered: int = 0  # how many mixtures among the earlier demonstrations a round works on, drawn anew each time; 0: all
+    remembered: int = 0  # how many mixtures among the earlier demonstrations a round works on (``DMSRD._remembered``); 0: all
     measured_rollouts: int = 10  # for the KL before and after a round
     audit_every: int = 0  # measure KL and recognition of all demonstrations after every so many; 0: never
 
@@ -187,13 +187,17 @@ class DMSRD:
         return replace(state, records=(*old.records, plain(record)))
 
     def _remembered(self, state: LifelongState, seed) -> np.ndarray:
-        """The demonstrations that this round works on: the pure ones, the newest, and a bounded sample of the others."""
-        everyone = np.arange(len(state.weights))
+        """The demonstrations that this round works on: the pure ones, the newest, and a bounded number of the others.
+
+        Of these first the one with the largest weight on each strategy, which its reward confuses most easily with its own.
+        """
+        everyone, n = np.arange(len(state.weights)), self.settings.remembered
         others = np.setdiff1d(everyone, [*state.pure, everyone[-1]])
-        if not 0 < self.settings.remembered < len(others):
+        if not 0 < n < len(others):
             return everyone
-        drawn = np.random.default_rng(seed).choice(others, self.settings.remembered, replace=False)
-        return np.union1d(np.setdiff1d(everyone, others), drawn)
+        nearest = np.unique(others[state.weights[others].argmax(0)])[:n]
+        drawn = np.random.default_rng(seed).choice(np.setdiff1d(others, nearest), n - len(nearest), replace=False)
+        return np.union1d(np.setdiff1d(everyone, others), [*nearest, *drawn])
 
     def _recognized(self, state: LifelongState, some: np.ndarray) -> np.ndarray:
         """Does each strategy reward rank its pure demonstration first among ``some``? (M,) bool."""

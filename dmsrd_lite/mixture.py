@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import minimize, nnls
 
 from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.envs import InputError
@@ -61,7 +61,7 @@ class MixtureSettings:
     search_rollouts: int = 2  # per candidate, to choose the finalists
     n_finalists: int = 6
     final_rollouts: int = 10  # of the protocol (``policy_divergences``)
-    regression: bool = False  # try ``regress_weights`` first; near enough, it saves the search (beyond the paper)
+    from_actions: bool = False  # try ``likeliest_weights`` first; near enough, they save the search (beyond the paper)
 
 
 @dataclass(frozen=True)
@@ -75,20 +75,47 @@ class MixtureFit:
     steps: int  # environment steps spent
 
 
-def regress_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
-    """The mixture whose means are nearest to what one demonstrator did: weights (M,), without a rollout.
+def inside_bounds(actor: Actor, demonstration: DemonstrationSet) -> tuple[np.ndarray, ...]:
+    """Actions (N,) of one demonstrator, and the actor's means and sigmas there (M, N), in half ranges; without those at a bound.
 
-    ``min_w sum_t |a_t - sum_j w_j mu_j(s_t)|^2`` over the simplex, actions in half ranges: the most likely weights if sigma did
-    not depend on them. An action at a bound is left out, because it was wished larger.
+    An action at its bound says only that at least so much was wished.
     """
     domain, actions = demonstration.domain, demonstration.actions[0].reshape(-1, demonstration.domain.action_dim)
     states = demonstration.observations[0, :, : demonstration.horizon].reshape(1, len(actions), -1)
     low, high = np.array(domain.action_low), np.array(domain.action_high)
     inside = (actions > low + 1e-6) & (actions < high - 1e-6)
-    scale = np.broadcast_to((high - low) / 2, actions.shape)[inside]
-    a = (actor.mean(states)[:, inside] / scale).T.astype(np.float64)  # (steps inside, M)
+    half_range, means = (high - low) / 2, actor.mean(states)
+    return tuple((x / half_range)[..., inside] for x in (actions, means, np.broadcast_to(actor.sigma, means.shape)))
+
+
+def regress_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
+    """The mixture whose means are nearest to what one demonstrator did: weights (M,), without a rollout.
+
+    ``min_w sum_t |a_t - sum_j w_j mu_j(s_t)|^2`` over the simplex, actions in half ranges.
+    """
+    a, mu, _ = (x.astype(np.float64) for x in inside_bounds(actor, demonstration))
     one = 1e3 * np.sqrt(1 + len(a))  # a row that holds the sum of the weights at one
-    weights, _ = nnls(np.vstack([a, np.full((1, a.shape[1]), one)]), np.append(actions[inside] / scale, one))
+    weights, _ = nnls(np.vstack([mu.T, np.full((1, len(mu)), one)]), np.append(a, one))
+    return weights / weights.sum()
+
+
+def likeliest_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
+    """The mixture under which one demonstrator's actions are the most likely: weights (M,), without a rollout.
+
+    ``max_w sum_t log N(a_t; sum_j w_j mu_j(s_t), (sum_j w_j sigma_j)^2)`` over the simplex. Least squares if all sigmas are equal;
+    where they are not, how widely somebody acts tells the weights as well.
+    """
+    a, mu, sigma = (x.astype(np.float64) for x in inside_bounds(actor, demonstration))
+
+    def loss(w):
+        spread = w @ sigma
+        z = (a - w @ mu) / spread
+        return np.mean(np.log(spread) + z * z / 2), ((sigma * (1 - z * z) - mu * z) / spread).mean(1)
+
+    m = len(mu)
+    simplex = {"type": "eq", "fun": lambda w: w.sum() - 1, "jac": np.ones_like}
+    found = minimize(loss, np.full(m, 1 / m), jac=True, method="SLSQP", bounds=[(0, 1)] * m, constraints=simplex, options={"ftol": 1e-9})
+    weights = np.clip(found.x, 0, None)
     return weights / weights.sum()
 
 
@@ -107,7 +134,7 @@ def search_mixture(
     Candidates: the pure strategies, the incumbent, Dirichlet(1) draws, half of them cut down to two or three strategies, then
     refinements around the best; each round is one batch of rollouts. The finalists are measured by the protocol of
     every KL here, and the winner once more on rollouts of its own, because the least of several noisy numbers is too low.
-    With ``regression`` those weights are measured first, and taken if they come within ``enough`` nats.
+    With ``from_actions`` ``likeliest_weights`` are measured first, and taken if they come within ``enough`` nats.
     """
     m, s, rng = actor.n_strategies, settings, np.random.default_rng(seed)
     if demonstration.n_demonstrations != 1:
@@ -128,12 +155,12 @@ def search_mixture(
         steps += len(weights) * n_rollouts * demonstration.horizon
         return policy_divergences(Mixtures(actor, weights), demonstration, [*seeds, part], n_rollouts=n_rollouts, n_threads=n_threads)
 
-    if s.regression and m > 1:
-        regressed = regress_weights(actor, demonstration)[None]
-        divergences = measure(regressed, 5, s.final_rollouts)
+    if s.from_actions and m > 1:
+        likeliest = likeliest_weights(actor, demonstration)[None]
+        divergences = measure(likeliest, 5, s.final_rollouts)
         if divergences[0] <= enough:
-            return MixtureFit(regressed[0], float(divergences[0]), regressed, divergences, steps)
-        candidates = np.vstack([candidates, regressed])
+            return MixtureFit(likeliest[0], float(divergences[0]), likeliest, divergences, steps)
+        candidates = np.vstack([candidates, likeliest])
     divergences = measure(candidates, 1, s.search_rollouts)
     if m > 1 and s.n_refinements:
         around = rng.dirichlet(s.concentration * candidates[divergences.argmin()] + 0.1, s.n_refinements)

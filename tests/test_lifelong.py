@@ -542,6 +542,16 @@ def test_a_round_works_on_a_bounded_sample_and_measures_no_more(three, states, m
     )
 
 
+def test_the_mixture_nearest_to_each_strategy_is_always_remembered():
+    table = np.vstack([np.eye(2), np.random.default_rng(0).dirichlet((2, 2), 20)])
+    nearest = {2 + int(table[2:-1, 0].argmax()), 2 + int(table[2:-1, 1].argmax())}
+    state = LifelongState(INVERTED_PENDULUM, 0, None, table, (0, 1))
+    learner = DMSRD(INVERTED_PENDULUM, dataclasses.replace(TINY, remembered=4), 0, 1, state)
+    drawn = [set(learner._remembered(state, seed)) for seed in range(50)]
+    assert all(len(some) == 2 + 1 + 4 and {0, 1, 21} | nearest <= some for some in drawn)
+    assert len(set.union(*drawn)) == 22, "the other two are drawn among all"
+
+
 def test_an_audit_measures_everybody(three, states):
     learner = DMSRD(INVERTED_PENDULUM, dataclasses.replace(GENEROUS, remembered=1, audit_every=2), 0, 1, states[2])
     records = list(learner.learn(three.select([2, 2])))

@@ -6,7 +6,7 @@ from dmsrd_lite import mixture
 from dmsrd_lite.demonstrations import DemonstrationSet, demonstrations_from
 from dmsrd_lite.envs import INVERTED_PENDULUM, InputError
 from dmsrd_lite.metrics import policy_divergences
-from dmsrd_lite.mixture import Mixtures, MixtureSettings, check_weights, regress_weights, search_mixture
+from dmsrd_lite.mixture import Mixtures, MixtureSettings, check_weights, likeliest_weights, regress_weights, search_mixture
 from dmsrd_lite.networks import Actor, GaussianPolicies
 from dmsrd_lite.rollouts import rollout
 
@@ -227,13 +227,34 @@ def test_regressed_weights_are_the_least_squares_on_the_simplex(actor):
     assert found.min() >= 0
 
 
-def test_near_regressed_weights_save_the_search():
+def test_likeliest_weights_are_told_by_sigma_where_the_means_are_equal():
+    """Closed form: ``w s_0 + (1 - w) s_1`` is the root mean square distance of the actions from the mean."""
+    one = balancers([0.0], sigma=0.1)
+    actor = Actor.joined([one, one.select([0], 3.0)])
+    shown = shown_by(Mixtures(actor, [[0.35, 0.65]]), 400)
+    means = actor.mean(np.repeat(shown.observations[:, :, :400].reshape(1, -1, 4), 2, 0))[0, :, 0]
+    spread = np.sqrt(np.square(shown.actions.ravel() - means).mean())
+    assert likeliest_weights(actor, shown)[0] == pytest.approx((spread - 0.3) / (0.1 - 0.3), abs=1e-3)
+    assert likeliest_weights(actor, shown)[0] == pytest.approx(0.35, abs=0.05)
+
+
+def test_likeliest_weights_are_the_least_squares_where_the_sigmas_are_equal():
+    actor = balancers([-0.3, 0.0, 0.4])
+    shown = shown_by(Mixtures(actor, [[0.2, 0.5, 0.3]]), 200)
+    means = actor.mean(np.repeat(shown.observations[:, :, :200].reshape(1, -1, 4), 3, 0))[..., 0]
+    likeliest, regressed = likeliest_weights(actor, shown), regress_weights(actor, shown)
+    assert likeliest @ means == pytest.approx(regressed @ means, abs=1e-3)  # of the weights only one direction shows: the place
+    assert likeliest.sum() == pytest.approx(1)
+    assert likeliest.min() >= 0
+
+
+def test_near_weights_from_actions_save_the_search():
     actor = balancers([-0.4, 0.4])
     shown = shown_by(balancers([0.4]), 60)
-    settings = MixtureSettings(4, 2, search_rollouts=1, n_finalists=2, final_rollouts=2, regression=True)
+    settings = MixtureSettings(4, 2, search_rollouts=1, n_finalists=2, final_rollouts=2, from_actions=True)
     near = search_mixture(actor, shown, settings, 0, enough=1e9)
     assert (len(near.candidates), near.steps) == (1, 2 * 60)
-    assert np.array_equal(near.weights, regress_weights(actor, shown))
+    assert np.array_equal(near.weights, likeliest_weights(actor, shown))
     far = search_mixture(actor, shown, settings, 0, enough=-1e9)
     assert far.steps > near.steps
     assert any(np.array_equal(row, near.weights) for row in far.candidates), "it is a candidate all the same"

@@ -10,7 +10,7 @@ from dmsrd_lite.demonstrations import load_shipped
 from dmsrd_lite.envs import DOMAINS
 from dmsrd_lite.lifelong import SETTINGS
 from dmsrd_lite.methods import restore, score_method
-from dmsrd_lite.runs import RECORDS, load_record
+from dmsrd_lite.runs import RECORDS, ROOT, load_record
 
 NAMES = sorted(path.stem for path in Path(RECORDS).glob("08_lifelong_*.json"))
 
@@ -48,3 +48,64 @@ class TestStream:
         first = np.mean(np.subtract(audits[0], results["floor"][:10]))
         last = np.mean(np.subtract(audits[-1][:10], results["floor"][:10]))
         assert last - first <= 1.0, "the first ten, after all others"
+
+
+def _cells(domain: str, trials: list[dict]) -> list[str]:
+    """The README's column of a task, from the results of its trials, trial by trial."""
+
+    def each(number, form: str) -> str:
+        return " / ".join(format(number(r), form) for r in trials)
+
+    def ratio(r):
+        seconds = [x["seconds"] for x in r["records"]]
+        return np.mean(seconds[90:100]) / np.mean(seconds[10:20])
+
+    def by_branch(r):
+        return sum(x["branch"] == "new strategy" for x in r["records"])
+
+    horizon = DOMAINS[domain].horizon
+    return [
+        each(by_branch, "d"),
+        each(lambda r: np.mean(np.subtract(r["table"]["divergence"], r["floor"])), ".2f"),
+        each(lambda r: np.mean(r["table"]["log_likelihood_per_step"]) * horizon, ".0f"),
+        each(lambda r: np.mean(r["table"]["environment_return"]), ".1f"),
+        each(lambda r: r["table"]["task_correlation"], ".3f"),
+        each(lambda r: r["table"]["recognized"], ".0%"),
+        each(lambda r: r["weight_error"], ".3f"),
+        each(ratio, ".2f"),
+        each(lambda r: r["stream_seconds"] / 60, ".1f"),
+        each(lambda r: r["peak_gb"], ".2f"),
+    ]
+
+
+ROWS = {
+    "strategies found": "5 / 9",
+    "KL above the floor (nats)": "12.5 (KL itself)",
+    "log-likelihood of a trajectory": "-2298.4",
+    "return": "-8.0",
+    "task reward's correlation with the true return": "0.889",
+    "strategies recognised": "100%",
+    "mean absolute error of the weights": "-",
+    "seconds of users 91-100 over those of users 11-20": "-",
+    "minutes": "-",
+    "memory (GB)": "-",
+}
+
+
+def readme_rows() -> list[str]:
+    columns = []
+    for domain in DOMAINS:
+        names = [name for name in NAMES if name.startswith(f"08_lifelong_{domain}_seed") and "users" not in name]
+        columns.append(_cells(domain, [load_record(name)[0]["results"] for name in names]))
+    return [f"| {row} | {' | '.join(cells)} | {paper} |" for (row, paper), *cells in zip(ROWS.items(), *columns, strict=True)]
+
+
+@pytest.mark.skipif(len(NAMES) < 4, reason="the trials are not recorded")
+def test_readme_shows_the_recorded_numbers():
+    text = " ".join((ROOT / "README.md").read_text().split())
+    for row in readme_rows():
+        assert row in text
+
+
+if __name__ == "__main__":
+    print(*readme_rows(), sep="\n")
