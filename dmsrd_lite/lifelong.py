@@ -156,12 +156,12 @@ class DMSRD:
             networks, steps["msrd"] = self._round(state, some, learn_task, [*seed, 4])
             state = replace(state, networks=networks)
         after = self._divergences(state, some, [*seed, 3]) if len(pure) > 1 else before
-        risen = (before <= thresholds) & (after > thresholds)
-        for i, kl in zip(some[risen], after[risen], strict=True):  # a mixture that its own strategies have moved away from
+        risen = (after > thresholds) & (len(pure) > 1)
+        for i, kl, enough in zip(some[risen], after[risen], thresholds[risen], strict=True):  # its own strategies have moved away
             if i in {*pure, n}:
                 continue
             one, policies = known.select([i]), self._at(state).policies().actor()
-            fit = search_mixture(policies, one, s.mixture, [*seed, 5, i], incumbent=table[i], n_threads=self.n_threads)
+            fit = search_mixture(policies, one, s.mixture, [*seed, 5, i], incumbent=table[i], enough=enough, n_threads=self.n_threads)
             searched[int(i)], steps["search"] = [kl, fit.divergence], steps["search"] + fit.steps
             table[i] = fit.weights if fit.divergence < kl else table[i]
         record = {

@@ -226,7 +226,7 @@ def test_the_round_has_all_demonstrations_and_the_decided_weights(three, states,
         (1.0, 9.0, 3.0, True, True),  # risen above the threshold of 2.0, and something nearer is found
         (2.0, 9.0, 9.0, True, False),  # nothing nearer is found
         (1.0, 2.0, 1.0, False, False),  # at the threshold
-        (3.0, 9.0, 1.0, False, False),  # it was above before
+        (3.0, 9.0, 1.0, True, True),  # it was above before: risen in a round that did not remember it, perhaps
     ],
 )
 def test_an_older_mixture_is_searched_again_where_its_kl_has_risen(before, after_round, found, again, replaced, three, states, monkeypatch):
