@@ -103,6 +103,7 @@ class AIRL:
     """
 
     alpha = 0.0  # weight of the strategy rewards beside a shared task reward; 0: no task reward
+    learns_policies = True  # False: only rewards learn
 
     def __init__(
         self,
@@ -180,10 +181,9 @@ class AIRL:
             loss, accuracy = self._discriminate(seeds[2])
             self._average()
             clock.append(time.perf_counter())
-            demonstrations = (self.x, self.actions)
-            self.optimizer.update(
-                data, self.policy_rewards(data), seeds[3], demonstrations=demonstrations, cloning_weight=self.settings.cloning_weight
-            )
+            shown, weight = (self.x, self.actions), self.settings.cloning_weight
+            if self.learns_policies:
+                self.optimizer.update(data, self.policy_rewards(data), seeds[3], demonstrations=shown, cloning_weight=weight)
             clock.append(time.perf_counter())
             self.iteration = iteration + 1  # a reader may stop here and call ``train`` again
             yield {

@@ -60,15 +60,18 @@ def _cells(domain: str, trials: list[dict]) -> list[str]:
         seconds = [x["seconds"] for x in r["records"]]
         return np.mean(seconds[90:100]) / np.mean(seconds[10:20])
 
-    def by_branch(r):
-        return sum(x["branch"] == "new strategy" for x in r["records"])
+    def lost(r):
+        last = max((x for x in r["records"] if "audit" in x), key=lambda x: x["demonstration"])["audit"]["kl"]
+        return sum(kl > x["threshold"] for kl, x in zip(last, r["records"], strict=True))
 
     horizon = DOMAINS[domain].horizon
     return [
-        each(by_branch, "d"),
+        each(lambda r: len(r["pure"]), "d"),
         each(lambda r: np.mean(np.subtract(r["table"]["divergence"], r["floor"])), ".2f"),
+        each(lost, "d"),
         each(lambda r: np.mean(r["table"]["log_likelihood_per_step"]) * horizon, ".0f"),
         each(lambda r: np.mean(r["table"]["environment_return"]), ".1f"),
+        each(lambda r: np.mean(r["table"]["failure_share"]), ".1%"),
         each(lambda r: r["table"]["task_correlation"], ".3f"),
         each(lambda r: r["table"]["recognized"], ".0%"),
         each(lambda r: r["weight_error"], ".3f"),
@@ -81,12 +84,14 @@ def _cells(domain: str, trials: list[dict]) -> list[str]:
 ROWS = {
     "strategies found": "5 / 9",
     "KL above the floor (nats)": "12.5 (KL itself)",
+    "users above their own threshold at the end": "-",
     "log-likelihood of a trajectory": "-2298.4",
     "return": "-8.0",
+    "failures": "-",
     "task reward's correlation with the true return": "0.889",
     "strategies recognised": "100%",
     "mean absolute error of the weights": "-",
-    "seconds of users 91-100 over those of users 11-20": "-",
+    "seconds of the last ten users over those of users 10 to 19": "-",
     "minutes": "-",
     "memory (GB)": "-",
 }
