@@ -1,5 +1,6 @@
 """The recorded streams of lesson 08, scored anew from the networks that they stored."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,7 @@ ROWS = {
 def readme_rows() -> list[str]:
     columns = []
     for domain in DOMAINS:
-        names = [name for name in NAMES if name.startswith(f"08_lifelong_{domain}_seed") and "users" not in name]
+        names = [name for name in NAMES if re.fullmatch(rf"08_lifelong_{domain}_seed\d+", name)]
         columns.append(_cells(domain, [load_record(name)[0]["results"] for name in names]))
     return [f"| {row} | {' | '.join(cells)} | {paper} |" for (row, paper), *cells in zip(ROWS.items(), *columns, strict=True)]
 
