@@ -260,5 +260,6 @@ class AIRL:
     def _average(self) -> None:
         decay = min(self.settings.reward_average, self.n_averaged / (self.n_averaged + 3))  # forgets the start faster
         for mean, now in zip(self.averaged_rewards.parameters(), self.rewards.parameters(), strict=True):
-            mean.mul_(decay).add_(now, alpha=1 - decay)
+            if now.requires_grad:
+                mean.mul_(decay).add_(now, alpha=1 - decay)
         self.n_averaged += 1

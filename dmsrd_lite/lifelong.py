@@ -30,7 +30,7 @@ class LifelongSettings:
     airl: AIRLSettings = AIRLSettings(n_iterations=12)
     msrd: MSRDSettings = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=24)  # one round after each demonstration
     mixture: MixtureSettings = MixtureSettings()
-    all_after_mixture: bool = True  # R_Task and policies learn in the round after a mixture, too (the paper), or only g_j
+    policies_after_mixture: bool = True  # policies learn in the round after a mixture, too (the paper), or only rewards
     remembered: int = 0  # how many mixtures among the earlier demonstrations a round works on (``DMSRD._remembered``); 0: all
     measured_rollouts: int = 10  # for the KL before and after a round
     audit_every: int = 0  # measure KL and recognition of all demonstrations after every so many; 0: never
@@ -150,12 +150,12 @@ class DMSRD:
         state = replace(old, demonstrations=known, weights=table, pure=pure, networks=networks)
         some = self._remembered(state, [*seed, 6])
         thresholds = np.array([*(r["threshold"] for r in old.records), threshold])[some]
-        learn_all = s.all_after_mixture or branch == "new strategy"
-        before = after = self._divergences(state, some, [*seed, 3]) if learn_all else np.zeros(0)
+        moving = s.policies_after_mixture or branch == "new strategy"
+        before = after = self._divergences(state, some, [*seed, 3]) if moving else np.zeros(0)
         if len(pure) > 1:
-            networks, steps["msrd"] = self._round(state, some, learn_all, [*seed, 4])
+            networks, steps["msrd"] = self._round(state, some, moving, [*seed, 4])
             state = replace(state, networks=networks)
-            after = self._divergences(state, some, [*seed, 3]) if learn_all else before
+            after = self._divergences(state, some, [*seed, 3]) if moving else before
         searched, risen = {}, np.flatnonzero(after > thresholds[: len(after)]) if len(pure) > 1 else ()
         for k in risen:  # its own strategies have moved away
             i, kl = some[k], after[k]
@@ -237,15 +237,14 @@ class DMSRD:
         old = self.state.networks
         return {k: (old[k] if _is_shared(k) else torch.cat([old[k], v])) if old else v for k, v in new.items()}
 
-    def _round(self, state: LifelongState, some: np.ndarray, learn_all: bool, seed) -> tuple[dict[str, torch.Tensor], int]:
+    def _round(self, state: LifelongState, some: np.ndarray, moving: bool, seed) -> tuple[dict[str, torch.Tensor], int]:
         """MSRD on the pure demonstrations with BCD on ``some``; returns the networks and the steps of all strategies."""
         s, pure = self.settings, state.pure
         known = state.demonstrations.select(some), state.weights[some], np.searchsorted(some, pure)
         between = known if s.between_class else None
         learner = MSRD(state.demonstrations.select(pure), s.msrd, seed, self.n_threads, networks=state.networks, between=between)
         learner.n_averaged = s.msrd.n_iterations * sum(r["n_strategies"] > 1 for r in state.records)
-        learner.rewards.task_reward.requires_grad_(learn_all)
-        learner.learns_policies = learn_all
+        learner.learns_policies = moving
         for _ in learner.train():
             pass
         learner.settle()
