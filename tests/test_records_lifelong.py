@@ -62,8 +62,7 @@ def _cells(domain: str, trials: list[dict]) -> list[str]:
         return np.mean(seconds[90:100]) / np.mean(seconds[10:20])
 
     def lost(r):
-        last = max((x for x in r["records"] if "audit" in x), key=lambda x: x["demonstration"])["audit"]["kl"]
-        return sum(kl > x["threshold"] for kl, x in zip(last, r["records"], strict=True))
+        return sum(kl > x["threshold"] for kl, x in zip(r["table"]["divergence"], r["records"], strict=True))
 
     horizon = DOMAINS[domain].horizon
     return [
@@ -77,7 +76,7 @@ def _cells(domain: str, trials: list[dict]) -> list[str]:
         each(lambda r: r["table"]["recognized"], ".0%"),
         each(lambda r: r["weight_error"], ".3f"),
         each(ratio, ".2f"),
-        each(lambda r: r["stream_seconds"] / 60, ".1f"),
+        each(lambda r: r["stream_seconds"] / 60 if not r["resumed"] else float("nan"), ".1f"),
         each(lambda r: r["peak_gb"], ".2f"),
     ]
 
