@@ -16,7 +16,7 @@ from dmsrd_lite.discrimination import recognized
 from dmsrd_lite.divergence import own_divergence
 from dmsrd_lite.envs import Domain, InputError
 from dmsrd_lite.metrics import policy_divergences
-from dmsrd_lite.mixture import Mixtures, MixtureSettings, search_mixture
+from dmsrd_lite.mixture import MixtureFit, Mixtures, MixtureSettings, search_mixture
 from dmsrd_lite.msrd import MSRD, MSRDSettings
 from dmsrd_lite.networks import GaussianPolicies, under
 
@@ -156,17 +156,13 @@ class DMSRD:
             networks, steps["msrd"] = self._round(state, some, moving, [*seed, 4])
             state = replace(state, networks=networks)
             after = self._divergences(state, some, [*seed, 3]) if moving else before
-        searched, risen = {}, np.flatnonzero(after > thresholds[: len(after)]) if len(pure) > 1 else ()
+        risen = [k for k in np.flatnonzero(after > thresholds[: len(after)]) if len(pure) > 1 and some[k] not in {*pure, n}]
+        searched = {}
         for k in risen:  # its own strategies have moved away
-            i, kl = some[k], after[k]
-            if i in {*pure, n}:
-                continue
-            one, policies = known.select([i]), self._at(state).policies().actor()
-            fit = search_mixture(
-                policies, one, s.mixture, [*seed, 5, i], incumbent=table[i], enough=thresholds[k], n_threads=self.n_threads
-            )
-            searched[int(i)], steps["search"] = [kl, fit.divergence], steps["search"] + fit.steps
-            table[i] = fit.weights if fit.divergence < kl else table[i]
+            i = int(some[k])
+            fit = self._search_again(state, i, thresholds[k], [*seed, 5, i])
+            searched[i], steps["search"] = [after[k], fit.divergence], steps["search"] + fit.steps
+            table[i] = fit.weights if fit.divergence < after[k] else table[i]
         record = {
             "demonstration": n,
             "branch": branch,
@@ -188,6 +184,12 @@ class DMSRD:
             everyone = np.arange(n + 1)
             record["audit"] = {"kl": self._divergences(state, everyone, [*seed, 8]), "recognized": self._recognized(state, everyone)}
         return replace(state, records=(*old.records, plain(record)))
+
+    def _search_again(self, state: LifelongState, i: int, threshold: float, seed) -> MixtureFit:
+        """The mixture search for demonstration ``i`` of the state, its present weights among the candidates."""
+        policies, shown = self._at(state).policies().actor(), state.demonstrations.select([i])
+        keywords = {"incumbent": state.weights[i], "enough": threshold, "n_threads": self.n_threads}
+        return search_mixture(policies, shown, self.settings.mixture, seed, **keywords)
 
     def _remembered(self, state: LifelongState, seed) -> np.ndarray:
         """The demonstrations that this round works on: the pure ones, the newest, and a bounded number of the others.
