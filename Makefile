@@ -1,19 +1,31 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
+CODE := dmsrd_lite tests notebooks
 
-.PHONY: workbook test lab lint lock
+.PHONY: workbook test verify lab lint lock results
 
 workbook: .venv/installed
 	$(BIN)/python -m dmsrd_lite run papermill_runs/plans/quick.toml
 
 test: .venv/installed lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -m "not verify" -n 2
+
+verify: .venv/installed
+	$(BIN)/python -m pytest -m verify -n 2
 
 lab: .venv/installed
-	$(BIN)/jupyter lab notebooks
+	$(BIN)/python -m dmsrd_lite lab $(ROOT)
 
 lint: .venv/installed
-	$(BIN)/ruff check dmsrd_lite tests notebooks && $(BIN)/ruff format --check dmsrd_lite tests notebooks && $(BIN)/nbstripout --verify $$(git ls-files '*.ipynb')
+	$(BIN)/ruff check $(CODE)
+	$(BIN)/ruff format --check $(CODE)
+	$(BIN)/lint-imports
+	$(BIN)/mypy
+	$(BIN)/nbstripout --verify $$(git ls-files 'notebooks/*.ipynb') || \
+	  { echo "a notebook holds outputs: run $(BIN)/nbstripout on it, and read in the copy that 'make lab' makes"; exit 1; }
+
+results: .venv/installed
+	$(BIN)/python -m dmsrd_lite results
 
 lock: .venv/installed
 	$(BIN)/pip freeze --exclude-editable | sed 's/+cpu$$//' > requirements.lock

@@ -1,35 +1,43 @@
-"""Command line: ``python -m dmsrd_lite {generate,validate,run,bench,gallery}``."""
+"""Command line: ``python -m dmsrd_lite {generate,validate,run,results,bench,gallery,lab}``."""
 
 import argparse
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
-from dmsrd_lite.envs import InputError, check_seed, get_domain
+from dmsrd_lite.domains import InputError, get_domain
+from dmsrd_lite.domains.domain import check_whole
 
 
-def _generate(arguments) -> int:
-    from functools import partial
-
+def _generate(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from dmsrd_lite.demonstrations import DATA_FOLDER, check_folder
-    from dmsrd_lite.diayn import DEVELOPMENT_SEED, TEST_SEED, generate_demonstrations, generate_lifelong, generate_test_set
+    from dmsrd_lite.demonstrators import reward_test_sets, streams
+    from dmsrd_lite.workbook import presets
 
-    domain, seed = get_domain(arguments.domain), check_seed(arguments.seed)
+    domain, seed = get_domain(arguments.domain), check_whole(arguments.seed, "seed")
     folder = Path(arguments.output).resolve() if arguments.output else DATA_FOLDER
     check_folder(folder / "any")
-    generate = generate_lifelong if arguments.lifelong else generate_demonstrations
-    print(json.dumps(generate(domain, seed, folder, progress=partial(tqdm, desc="demonstrators"))))
-    if not (arguments.demonstrations_only or arguments.lifelong):
-        for kind, offset, episodes in (("test_set", TEST_SEED, 10), ("development_set", DEVELOPMENT_SEED, 1)):
-            path = folder / f"{domain.name}_{kind}.npz"
-            generate_test_set(domain, seed + offset, path, n_episodes=episodes, progress=partial(tqdm, desc=kind))
-            print(path)
+    generate = streams.generate_lifelong if arguments.lifelong else streams.generate_demonstrations
+    bar = partial(tqdm, desc="demonstrators")
+    print(json.dumps(generate(domain, presets.DEMONSTRATORS[domain.name], seed, folder, progress=bar)))
+    kinds = {
+        "test_set": (reward_test_sets.TEST_SEED, 10),
+        "development_set": (reward_test_sets.DEVELOPMENT_SEED, 1),
+    }
+    for kind, (offset, episodes) in (
+        {} if arguments.demonstrations_only or arguments.lifelong else kinds.items()
+    ):
+        path, settings = folder / f"{domain.name}_{kind}.npz", presets.TEST_SETS[domain.name]
+        bar, seed_of = partial(tqdm, desc=kind), seed + offset
+        make = partial(reward_test_sets.generate_test_set, n_episodes=episodes, progress=bar)
+        print(make(domain, settings, seed_of, path))
     return 0
 
 
-def _validate(arguments) -> int:
+def _validate(arguments: argparse.Namespace) -> int:
     from dmsrd_lite.demonstrations import validate_file
 
     faults = [fault for path in arguments.files for fault in validate_file(path)]
@@ -37,70 +45,110 @@ def _validate(arguments) -> int:
     return 2 if faults else 0
 
 
-def _run(arguments) -> int:
-    from dmsrd_lite.plans import load_plan, run_plan
+def _run(arguments: argparse.Namespace) -> int:
+    from dmsrd_lite.workbook.plans import load_plan, run_plan
 
-    plan = load_plan(arguments.plan, arguments.output)
-    options = {name: getattr(arguments, name) for name in ("workers", "scheduler", "only", "force", "dry_run")}
-    return 0 if run_plan(plan, **options) else 1
+    options = {
+        name: getattr(arguments, name) for name in ("workers", "scheduler", "only", "force", "dry_run")
+    }
+    return 0 if run_plan(load_plan(arguments.plan, arguments.output), **options) else 1
 
 
-def _bench(arguments) -> int:
-    from dmsrd_lite.bench import bench
+def _results(arguments: argparse.Namespace) -> int:
+    from dmsrd_lite.workbook.results import write_results
 
-    result = bench(check_seed(arguments.seed), n_iterations=arguments.iterations)
+    print(*write_results(Path(arguments.output).resolve() if arguments.output else None), sep="\n")
+    return 0
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from dmsrd_lite.workbook.bench import bench
+
+    result = bench(check_whole(arguments.seed, "seed"), check_whole(arguments.iterations, "iterations", 2))
     print(json.dumps(result, indent=None if arguments.json else 1))
     return 0
 
 
-def _gallery(arguments) -> int:
-    from dmsrd_lite.runs import export_gallery
+def _gallery(arguments: argparse.Namespace) -> int:
+    from dmsrd_lite.workbook.execution import export_gallery
 
     print(*export_gallery(Path(arguments.folder)), sep="\n")
     return 0
 
 
-def _at_least_one(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number of at least 1")
-    return int(text)
+def _lab(arguments: argparse.Namespace) -> int:
+    from dmsrd_lite.workbook.lab import open_lab
+
+    return open_lab(arguments.root)
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m dmsrd_lite", description="The helper package of the DMSRD workbook.")
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m dmsrd_lite", description="The helper package of the DMSRD workbook."
+    )
     commands = parser.add_subparsers(dest="command", required=True)
-    generate = commands.add_parser("generate", help="train demonstrators; write demonstrations, second take and test sets")
+
+    def command(name: str, action: object, text: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=text)
+        added.set_defaults(action=action)
+        return added
+
+    generate = command(
+        "generate", _generate, "train demonstrators; write demonstrations, second take and test sets"
+    )
     generate.add_argument("domain")
     generate.add_argument("--seed", default="0")
     generate.add_argument("--output", help="folder for the files (default: the repository's data)")
-    generate.add_argument("--demonstrations-only", action="store_true", help="leave the test and development sets as they are")
-    generate.add_argument("--lifelong", action="store_true", help="instead: a stream of 100 users, five of them and 95 mixtures")
-    validate = commands.add_parser("validate", help="say what is wrong with a demonstration or test file")
+    generate.add_argument("--demonstrations-only", action="store_true", help="no test and development sets")
+    generate.add_argument(
+        "--lifelong", action="store_true", help="instead: 100 users, five of them and 95 mixtures"
+    )
+    validate = command("validate", _validate, "say what is wrong with a demonstration or test file")
     validate.add_argument("files", nargs="+")
-    run = commands.add_parser("run", help="run what is left of a plan: one notebook, or several, with many parameters")
+    run = command("run", _run, "run what is left of a plan: one notebook, or several, with many parameters")
     run.add_argument("plan", help="a .toml file, as in papermill_runs/plans")
-    run.add_argument("--workers", type=_at_least_one, default=0, help="processes on this machine (default: one for every two cores)")
-    run.add_argument("--scheduler", default="", help="address of a Dask scheduler, as tcp://host:8786, to run there instead")
-    run.add_argument("--only", action="append", default=[], metavar="NAME=VALUE", help="only runs with this parameter (or notebook=NAME)")
+    run.add_argument(
+        "--workers",
+        type=partial(check_whole, name="workers", least=1),
+        default=0,
+        help="processes on this machine (default: one for every two cores)",
+    )
+    run.add_argument(
+        "--scheduler", default="", help="address of a Dask scheduler, as tcp://host:8786, to run there"
+    )
+    run.add_argument(
+        "--only", action="append", default=[], metavar="NAME=VALUE", help="only runs with this parameter"
+    )
     run.add_argument("--force", action="store_true", help="also the runs that are finished")
     run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
-    run.add_argument("--output", help="folder of records and executed notebooks (default: papermill_runs/NAME)")
-    bench = commands.add_parser("bench", help="training speed over raw simulator speed, in one run")
+    run.add_argument(
+        "--output", help="folder of records and executed notebooks (default: papermill_runs/NAME)"
+    )
+    results = command("results", _results, "make RESULTS.md and the tables from the records")
+    results.add_argument("--output", help="folder to write into (default: the repository)")
+    bench = command("bench", _bench, "training speed over raw simulator speed, in one run")
     bench.add_argument("--json", action="store_true", help="end with the result as one line of JSON")
     bench.add_argument("--seed", default="0")
-    bench.add_argument("--iterations", type=int, default=6)
-    gallery = commands.add_parser("gallery", help="take the README's figures out of a folder of executed notebooks")
+    bench.add_argument("--iterations", default="6")
+    gallery = command(
+        "gallery", _gallery, "take the figures of the gallery out of a folder of executed notebooks"
+    )
     gallery.add_argument("folder")
-    actions = {"gallery": _gallery, "generate": _generate, "validate": _validate, "run": _run, "bench": _bench}
-    arguments = parser.parse_args(argv)
+    lab = command("lab", _lab, "JupyterLab on a copy of the lessons that is yours")
+    lab.add_argument("--root", action="store_true", help="as root, which JupyterLab refuses otherwise")
+    return parser  # fmt: skip
+
+
+def main(argv: list[str] | None = None) -> int:
     try:
-        return actions[arguments.command](arguments)
+        arguments = _parser().parse_args(argv)
+        return arguments.action(arguments)
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        recorded = ": finished runs are recorded, the same command goes on with the others" if arguments.command == "run" else ""
-        print(f"stopped{recorded}", file=sys.stderr)
+        recorded = "finished runs are recorded, the same command goes on with the others"
+        print(f"stopped: {recorded}" if arguments.command == "run" else "stopped", file=sys.stderr)
         return 130
 
 

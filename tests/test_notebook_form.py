@@ -1,5 +1,6 @@
-"""The form of a lesson: what a reader can rely on in every notebook."""
+"""The form of a lesson: what a reader can rely on in every notebook. A failure says what to do."""
 
+import ast
 import re
 import statistics
 
@@ -7,67 +8,132 @@ import nbformat
 import papermill
 import pytest
 
-from dmsrd_lite.runs import ROOT, lessons
+from dmsrd_lite.workbook.lessons import NOTEBOOKS, lessons
+from dmsrd_lite.workbook.presets import KNOBS
+from dmsrd_lite.workbook.records import ROOT
 
-PATHS = lessons()
-SECTIONS = ("**Question.**", "**You will be able to**", "**Needs.**", "**Time.**", "**Predict first.**", "**Break it", "What we claim",
-            "What this does not show", "## Go on")  # fmt: skip
-
-
-def read(path):
-    notebook = nbformat.read(path, 4)
-    code = [c for c in notebook.cells if c.cell_type == "code"]
-    text = "\n".join(c.source for c in notebook.cells if c.cell_type == "markdown")
-    return notebook, code, text
+EXERCISES = sorted(NOTEBOOKS.glob("exercises/*/*.ipynb"))
+SECTIONS = ("**Question.**", "**You will be able to**", "**Needs.**", "**Time.**", "**Predict first.**",
+            "**Break it", "## What we claim", "## What this does not show", "## Go on")  # fmt: skip
+LINK = r"(?<!!)\[[^\]]*\]\(([^)#]+)[^)]*\)"
 
 
-def n_lines(cell):
-    return sum(1 for line in cell.source.splitlines() if line.strip())
+def name(path):
+    return str(path.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("path", PATHS, ids=lambda p: p.stem)
-class TestForm:
-    def test_sections(self, path):
-        notebook, _, text = read(path)
-        assert re.match(r"# \d\d \w+", notebook.cells[0].source)
-        plain = text.replace("### Break it", "**Break it")
-        assert [s for s in SECTIONS if s not in plain] == []
-
-    def test_stored_without_outputs_and_with_a_plain_kernel(self, path):
-        notebook, code, _ = read(path)
-        assert all(c.outputs == [] and c.execution_count is None for c in code)
-        assert notebook.metadata.kernelspec.name == "python3"
-        assert notebook.metadata.kernelspec.language == "python"
-
-    def test_parameters(self, path):
-        found = papermill.inspect_notebook(str(path))
-        assert {"domain", "preset", "seed"} <= set(found)
-        _, code, _ = read(path)
-        (cell,) = [c for c in code if "parameters" in c.metadata.get("tags", [])]
-        for line in cell.source.splitlines():
-            assert re.fullmatch(r"\w+: (str|int|float|bool) = [^#]+  # .+", line), line
-        assert len(found) == len(cell.source.splitlines()), "papermill must see every parameter"
-
-    def test_cells_are_short(self, path):
-        _, code, _ = read(path)
-        assert max(map(n_lines, code)) <= 25
-        assert statistics.median(map(n_lines, code)) <= 8
-
-    def test_no_magics_addresses_or_absolute_paths(self, path):
-        _, code, text = read(path)
-        for cell in code:
-            assert not re.search(r"^\s*[!%]", cell.source, re.M), cell.source
-        everything = text + "\n".join(c.source for c in code)
-        assert not re.search(r"https?://|(?<![\w.~])/(home|root|opt|tmp|work)/", everything)
-
-    def test_every_figure_is_explained(self, path):
-        notebook, _, _ = read(path)
-        for cell, following in zip(notebook.cells, [*notebook.cells[1:], None], strict=True):
-            if cell.cell_type == "code" and "plt.show()" in cell.source:
-                assert following is not None
-                assert "**Reading the figure.**" in following.source, cell.source
+class Lesson:
+    def __init__(self, path):
+        self.path, self.name, self.notebook = path, name(path), nbformat.read(path, 4)
+        self.code = [c for c in self.notebook.cells if c.cell_type == "code"]
+        self.sources = "\n".join(c.source for c in self.code)
+        self.text = "\n".join(c.source for c in self.notebook.cells if c.cell_type == "markdown")
 
 
-def test_the_repository_names_no_machine():
-    for path in (*ROOT.glob("*.md"), *ROOT.glob("*.toml"), *ROOT.glob("dmsrd_lite/*.py"), *ROOT.glob("*/*.md"), ROOT / "requirements.lock"):
-        assert not re.search(r"(?<![\w.~])/(home|root|opt|tmp|work)/\w", path.read_text()), path
+@pytest.fixture(params=lessons(), ids=lambda p: p.stem)
+def lesson(request):
+    return Lesson(request.param)
+
+
+def assert_none(faults, text):
+    assert not faults, f"{text}:\n" + "\n".join(f"  {fault}" for fault in faults)
+
+
+def test_sections(lesson):
+    title = lesson.notebook.cells[0].source
+    assert re.match(r"# \d\d \w+", title), f"{lesson.name}: the first cell begins with '# NN Topic'"
+    plain = lesson.text.replace("### Break it", "**Break it")
+    assert_none([s for s in SECTIONS if s not in plain], f"{lesson.name} lacks these sections")
+
+
+@pytest.mark.parametrize("path", [*lessons(), *EXERCISES], ids=name)
+def test_stored_without_outputs_and_with_a_plain_kernel(path):
+    lesson = Lesson(path)
+    outputs = any(c.outputs or c.execution_count for c in lesson.code)
+    remedy = f"run .venv/bin/nbstripout {lesson.name}, or read in the copy that `make lab` makes"
+    assert not outputs, f"{lesson.name} holds outputs: {remedy}"
+    spec = lesson.notebook.metadata.get("kernelspec", {})
+    kernel = (spec.get("name"), spec.get("language"))
+    assert kernel == ("python3", "python"), f"{lesson.name}: set the kernel to python3, language python"
+
+
+def test_parameters_are_commented_literals_and_those_of_the_presets(lesson):
+    (cell,) = [c for c in lesson.code if "parameters" in c.metadata.get("tags", [])]
+    lines, form = cell.source.splitlines(), r"\w+: (str|int|float|bool) = [^#]+  # .+"
+    bad = [line for line in lines if not re.fullmatch(form, line)]
+    assert_none(bad, f"{lesson.name}: write parameters as 'name: type = value  # what it is'")
+    found = papermill.inspect_notebook(str(lesson.path))
+    assert len(found) == len(lines), f"{lesson.name}: papermill does not see every parameter"
+    usual = {k: ast.literal_eval(p["default"]) for k, p in found.items()}
+    missing = [k for k in ("domain", "preset", "seed") if k not in usual]
+    assert_none(missing, f"{lesson.name} lacks these parameters")
+    knobs = {k: knob.default for k, knob in KNOBS.get(lesson.path.stem, {}).items()}
+    wrong = [k for k, default in knobs.items() if usual.get(k) != default]
+    assert_none(wrong, f"{lesson.name}: give these parameters the default of presets.KNOBS ({knobs})")
+
+
+def test_the_frame(lesson):
+    start = re.search(rf'lessons\.start\(\s*"{lesson.path.stem}",\s*domain,\s*preset,\s*seed', lesson.sources)
+    call = f'lessons.start("{lesson.path.stem}", domain, preset, seed, ...)'
+    assert start, f"{lesson.name}: begin with {call}"
+    used = "\n".join(c.source for c in lesson.code if "parameters" not in c.metadata.get("tags", []))
+    unused = [k for k in KNOBS.get(lesson.path.stem, {}) if not re.search(rf"\b{k}\b", used)]
+    assert_none(unused, f"{lesson.name}: hand these parameters to lessons.start")
+    for part in ("lesson.claim(", "lesson.hand_over("):
+        assert part in lesson.sources, f"{lesson.name}: end with {part}...)"
+    own = re.findall(r"\w+Settings\(.*", lesson.sources)
+    assert_none(own, f"{lesson.name}: move these numbers to workbook/presets.py")
+
+
+def test_cells_are_short(lesson):
+    lines = [sum(bool(line.strip()) for line in c.source.splitlines()) for c in lesson.code]
+    long = [c.source.splitlines()[0] for c, n in zip(lesson.code, lines, strict=True) if n > 25]
+    assert_none(long, f"{lesson.name}: split the cells that begin so, they have more than 25 lines")
+    median = statistics.median(lines)
+    assert median <= 8, f"{lesson.name}: half of the cells have more than {median} lines; at most 8"
+
+
+def test_no_magics_addresses_or_absolute_paths(lesson):
+    magics = re.findall(r"^\s*[!%].*", lesson.sources, re.M)
+    assert_none(magics, f"{lesson.name}: plain Python only")
+    elsewhere = r"https?://\S+|(?<![\w.~])/(?:home|root|opt|tmp|work)/\S*"
+    found = re.findall(elsewhere, lesson.text + "\n" + lesson.sources)
+    assert_none(found, f"{lesson.name}: works offline and on any machine")
+
+
+def test_every_figure_is_explained_fits_the_page_and_keeps_the_colours(lesson):
+    for cell, following in zip(lesson.notebook.cells, [*lesson.notebook.cells[1:], None], strict=True):
+        slides = "lessons.slider(" in cell.source and "return fig" in cell.source
+        if cell.cell_type == "code" and ("plt.show()" in cell.source or slides):
+            where = f"{lesson.name}: write **Reading the figure.** below\n{cell.source}"
+            assert following is not None, where
+            assert "**Reading" in following.source, where
+    wide = [w for w in re.findall(r"figsize=\((\d[\d.]*),", lesson.sources) if float(w) > 9]
+    assert_none(wide, f"{lesson.name}: figures are at most 9 inches wide")
+    colours = re.findall(r"""["']#[0-9A-Fa-f]{6}["']|\bcolor=["'](?!black|white)\w+["']""", lesson.sources)
+    assert_none(colours, f"{lesson.name}: take figures.INK, figures.INKS[k] or figures.strategy_style(k)")
+
+
+@pytest.mark.parametrize("path", [*lessons(), *EXERCISES, NOTEBOOKS / "START.md"], ids=name)
+def test_links_lead_somewhere(path):
+    text = path.read_text() if path.suffix == ".md" else Lesson(path).text
+    broken = [link for link in re.findall(LINK, text) if not (path.parent / link).exists()]
+    assert_none(broken, f"{name(path)}: these links lead nowhere")
+
+
+def test_needs_and_go_on_are_links(lesson):
+    needs = re.search(r"\*\*Needs\.\*\*(.*?)\*\*Time\.\*\*", lesson.text, re.S)[1]
+    go_on = lesson.text.split("## Go on")[1]
+    bare = re.findall(r"\b\d\d_[a-z]\w*", re.sub(LINK, "", needs + go_on))
+    assert_none(bare, f"{lesson.name}: write them as [02_airl](02_airl.ipynb)")
+    assert re.search(LINK, go_on), f"{lesson.name}: 'Go on' leads to the next lesson or the exercise"
+
+
+@pytest.mark.parametrize("page", ["README.md", "notebooks/START.md"])
+def test_the_map_names_every_lesson(page):
+    text = (ROOT / page).read_text()
+    assert_none([path.name for path in lessons() if f"{path.name})" not in text], f"{page} has no link to")
+
+
+def test_every_lesson_but_the_first_has_an_exercise():
+    assert {p.parent.name for p in EXERCISES} == {p.stem for p in lessons() if not p.stem.startswith("00_")}

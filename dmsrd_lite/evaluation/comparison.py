@@ -1,0 +1,149 @@
+"""Every method of the comparison through one door: the same demonstrations, budget, start and score."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from dmsrd_lite.demonstrations import DemonstrationSet, RewardTestSet
+from dmsrd_lite.domains import InputError
+from dmsrd_lite.domains.domain import Seed
+from dmsrd_lite.evaluation.metrics import correlations_on, score_policies
+from dmsrd_lite.learning.networks import GaussianPolicies, under
+from dmsrd_lite.method.airl import AIRL, AIRLSettings, Rewards
+from dmsrd_lite.method.between_class_discrimination import recognized
+from dmsrd_lite.method.dmsrd import DMSRDSettings, learn
+from dmsrd_lite.method.msrd import MSRD, MSRDSettings
+from dmsrd_lite.method.policy_mixture import Mixtures
+from dmsrd_lite.method.state import State
+
+METHODS = ("cloning", "AIRL Single", "AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD")
+
+
+@dataclass(frozen=True)
+class MethodSettings:
+    """``airl`` and ``msrd`` spend per strategy what DMSRD spends on the average; its search comes on top."""
+
+    airl: AIRLSettings = AIRLSettings(n_iterations=25)
+    msrd: MSRDSettings = MSRDSettings(n_iterations=25, discriminator_steps=24)
+    dmsrd: DMSRDSettings = DMSRDSettings()
+    batch_steps: int = 40  # discriminator updates per iteration of AIRL Batch, one model for all the data
+
+    def as_in_the_paper(self) -> "MethodSettings":
+        """No warm start, cloning term or coverage, and AIRL for a new strategy on its own reward alone."""
+        off: dict[str, Any] = {"warm_start": False, "cloning_weight": 0.0, "coverage": False}
+        airl, msrd = replace(self.dmsrd.airl, **off), replace(self.dmsrd.msrd, **off)
+        loop = replace(self.dmsrd, airl=airl, msrd=msrd, add_task_reward=False)
+        return replace(self, airl=replace(self.airl, **off), msrd=replace(self.msrd, **off), dmsrd=loop)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a method ended with: weights (n, M) say which policy or mixture explains which demonstration."""
+
+    policies: GaussianPolicies
+    weights: np.ndarray
+    rewards: Rewards | None = None
+    task_part: str = "g"  # the part of the rewards that is to know the task
+    pure: tuple[
+        int, ...
+    ] = ()  # the demonstration of each strategy reward; empty where there are no strategy rewards
+    steps: int = 0  # environment steps of training, all strategies together
+    search_steps: int = 0
+    seconds: float = 0.0
+
+    def actor(self) -> Mixtures:
+        return Mixtures(self.policies.actor(), self.weights)
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """Policies, rewards (without shaping) and weights, for a record."""
+        modules = {"policy": self.policies, **({"reward": self.rewards} if self.rewards else {})}
+        found = {
+            f"{name}.{k}": v.numpy()
+            for name, module in modules.items()
+            for k, v in module.state_dict().items()
+        }
+        return {**{k: v for k, v in found.items() if ".shaping." not in k}, "weights": self.weights}
+
+
+def train_method(
+    method: str, shown: DemonstrationSet, settings: MethodSettings, seed: int, progress: Callable = iter
+) -> Learned:
+    """Train one of ``METHODS`` on the demonstrations in their order; ``progress`` wraps an iterable."""
+    if method not in METHODS:
+        raise InputError(f"unknown method {method!r}: expected one of {', '.join(METHODS)}")
+    start, n = time.perf_counter(), shown.n_demonstrations
+    if method.startswith("DMSRD"):
+        loop = replace(settings.dmsrd, between_class=method == "DMSRD")
+        *_, state = progress(learn(State(shown.domain, seed), shown, loop))
+        return learned_by(state)
+    pure, weights, part = tuple(range(n)), np.eye(n), "g"
+    learner: AIRL
+    if method == "MSRD":
+        learner, part = MSRD(shown, settings.msrd, seed), "task"
+    elif method == "AIRL Batch":
+        pooled = replace(settings.airl, discriminator_steps=settings.batch_steps)
+        learner, pure, weights = AIRL(shown.pooled(), pooled, seed), (), np.ones((n, 1))
+    elif method == "AIRL Single":
+        learner = AIRL(shown, settings.airl, seed)
+    else:
+        only_clone = replace(settings.airl, n_iterations=0, coverage=False, warm_start=True)
+        clone = AIRL(shown, only_clone, seed).policies
+        return Learned(clone, weights, seconds=time.perf_counter() - start)
+    for _ in progress(learner.train()):
+        pass
+    steps, seconds = learner.steps * len(learner.x), time.perf_counter() - start
+    return Learned(learner.policies, weights, learner.averaged_rewards, part, pure, steps, 0, seconds)
+
+
+def learned_by(state: State) -> Learned:
+    """What DMSRD has learned from the demonstrations so far."""
+    steps = [record["steps"] for record in state.records]
+    spent = sum(s["airl"] + s["msrd"] for s in steps), sum(s["search"] for s in steps)
+    seconds = sum(record["seconds"] for record in state.records)
+    return Learned(state.policies(), state.weights, state.rewards(), "task", state.pure, *spent, seconds)
+
+
+def score_method(
+    learned: Learned,
+    shown: DemonstrationSet,
+    again: DemonstrationSet | None,
+    test_set: RewardTestSet | None,
+    seed: Seed,
+) -> dict[str, Any]:
+    """``score_policies`` of what explains each demonstration, and what its rewards know.
+
+    task_correlation: mean over the rewards that are to know the task. recognized, recognized_again: share of
+    strategy rewards that rank their pure demonstration first among all shown, and among the second takes; NaN
+    if there are none.
+    """
+    scores: dict[str, Any] = dict(score_policies(learned.actor(), shown, seed))
+    rewards, nothing = learned.rewards, float("nan")
+    scores |= {"task_correlation": nothing, "recognized": nothing, "recognized_again": nothing}
+    if rewards is not None and test_set is not None:
+        scores["task_correlation"] = float(correlations_on(test_set, rewards, learned.task_part).mean())
+    for name, take in (("recognized", shown), ("recognized_again", again)):
+        if rewards is not None and learned.pure and take is not None:
+            scores[name] = float(recognized(rewards.mean_rewards(take), learned.pure).mean())
+    return {
+        **scores,
+        "steps": learned.steps,
+        "search_steps": learned.search_steps,
+        "seconds": learned.seconds,
+    }
+
+
+def restore(
+    tensors: dict[str, np.ndarray], shown: DemonstrationSet, alpha: float = 0.0, pure: Sequence[int] = ()
+) -> Learned:
+    """What ``Learned.tensors`` kept, to be scored again; ``alpha`` as trained, 0 without a task reward."""
+    m = tensors["weights"].shape[1]
+    policies, rewards = GaussianPolicies(shown.domain, m, 0), Rewards(shown.domain, m, 0.99, 0, alpha)
+    for name, module in (("policy", policies), ("reward", rewards)):
+        kept = {k: torch.tensor(v) for k, v in under(name, tensors).items()}
+        module.load_state_dict(kept, strict=False)  # shaping is not kept
+    known = rewards if under("reward", tensors) else None
+    return Learned(policies, tensors["weights"], known, "task" if alpha else "g", tuple(pure))

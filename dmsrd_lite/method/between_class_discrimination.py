@@ -1,0 +1,34 @@
+"""Between-class discrimination: a strategy reward must know its own. Paper: Theorem 1, Equation 4."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+
+def between_class_loss(mean_rewards: torch.Tensor, weights: torch.Tensor, pure: torch.Tensor) -> torch.Tensor:
+    """``sum_i (exp(eta_S-j(tau_i)) - w_ij exp(eta_S-j(tau_m_j)))^2`` of each strategy j: (M,). Equation 4.
+
+    mean_rewards (M, n): ``eta_S-j(tau_i)``, the mean of g_j over the states of demonstration i - the mean, so
+    that long trajectories stay finite; weights (n, M), rows sum to one; pure (M,): the index ``m_j`` of the
+    demonstration that created strategy j. No gradient flows through the pure demonstration's term.
+    """
+    own = mean_rewards.gather(1, pure[:, None]).detach().exp()  # (M, 1)
+    return (mean_rewards.exp() - weights.T * own).square().sum(1)
+
+
+def relative_to_own(mean_rewards: torch.Tensor, pure: torch.Tensor) -> torch.Tensor:
+    """Mean rewards counted from the strategy's own demonstration: ``eta_S-j(tau_i) - eta_S-j(tau_m_j)``, (M,
+    n).
+
+    With a fixed horizon a constant added to a reward changes no policy, and Theorem 1 speaks of ratios only.
+    Equation 4 does feel it: beside a task reward that takes the constant over, all ``eta_S-j`` fall together
+    until both of its terms vanish.
+    """
+    return mean_rewards - mean_rewards.gather(1, pure[:, None])
+
+
+def recognized(mean_rewards: np.ndarray, pure: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Does strategy reward j rank its pure demonstration above all others? (M, n), pure (M,) -> (M,) bool."""
+    own = np.take_along_axis(mean_rewards, np.asarray(pure)[:, None], 1)
+    return (mean_rewards >= own).sum(1) == 1

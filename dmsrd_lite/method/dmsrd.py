@@ -1,0 +1,146 @@
+"""Dynamic multi-strategy reward distillation: demonstrations arrive one by one. Paper: Algorithm 1."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache, partial
+
+import numpy as np
+
+from dmsrd_lite.demonstrations import DemonstrationSet, plain
+from dmsrd_lite.domains import InputError
+from dmsrd_lite.method.airl import AIRL, AIRLSettings, Rewards
+from dmsrd_lite.method.divergence import own_divergence, policy_divergences
+from dmsrd_lite.method.msrd import MSRDSettings
+from dmsrd_lite.method.policy_mixture import MixtureSettings, search_mixture
+from dmsrd_lite.method.rounds import play_round
+from dmsrd_lite.method.state import State
+
+MIXTURE, BETTER_MIXTURE, NEW_STRATEGY = "mixture", "mixture, better than a new strategy", "new strategy"
+
+
+@dataclass(frozen=True)
+class DMSRDSettings:
+    kl_threshold: float = (
+        0.0  # eps: accept a mixture below this divergence (nats); 0: a reference + kl_margin
+    )
+    kl_margin: float = 0.5  # nats above the reference (``reference_divergence``)
+    add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
+    between_class: bool = True
+    airl: AIRLSettings = AIRLSettings(n_iterations=12)
+    msrd: MSRDSettings = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=24)  # a round
+    mixture: MixtureSettings = MixtureSettings()
+    policies_after_mixture: bool = (
+        True  # policies learn in the round after a mixture, too (the paper), or only rewards
+    )
+    remembered: int = 0  # how many earlier mixtures a round works on (``rounds.remembered``); 0: all
+    measured_rollouts: int = 10  # for the KL before and after a round
+    audit_every: int = 0  # measure KL and recognition of all demonstrations after every so many; 0: never
+
+    def __post_init__(self) -> None:
+        if self.kl_threshold < 0 or not np.isfinite(self.kl_threshold):
+            expected = "expected a positive number of nats, or 0 to calibrate it"
+            raise InputError(f"kl_threshold {self.kl_threshold!r}: {expected}")
+        if self.airl.coverage != self.msrd.coverage:
+            expected = "expected both or neither, because MSRD goes on with AIRL's"
+            raise InputError(f"coverage is on in only one of airl and msrd: {expected}")
+
+
+def learn(state: State, demonstrations: DemonstrationSet, settings: DMSRDSettings) -> Iterator[State]:
+    """Algorithm 1, line 1: what is known after each of the demonstrations, in their order; the last record
+    says why.
+
+    A state is replaced, never changed: an error leaves the last one as it was, and any of them can be gone on
+    from.
+    """
+    _check(state, demonstrations, settings)
+    for i in range(demonstrations.n_demonstrations):
+        state = learn_one(state, demonstrations.select([i]), settings)
+        if settings.audit_every and len(state.records) % settings.audit_every == 0:
+            state = _audited(state, settings)
+        yield state
+
+
+def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> State:
+    """Algorithm 1, lines 2 to 17, for one demonstration tau_i; the numbers are the paper's lines."""
+    s, started, n = settings, time.perf_counter(), len(state.weights)
+    state, seed, steps = replace(state, alpha=s.msrd.alpha), [state.seed, 102, n], {"search": 0, "airl": 0}
+    candidate = cache(
+        partial(_candidate, state, new, s, [*seed, 2])
+    )  # AIRL on tau_i, made when it is asked for
+    reference = reference_divergence(new, candidate, s, [*seed, 7])
+    eps = s.kl_threshold or reference + s.kl_margin
+    kl_mix = kl_new = float("inf")
+    if state.n_strategies:
+        policies = state.policies().actor()
+        fit = search_mixture(policies, new, s.mixture, [*seed, 1], enough=eps)  # 3: w = mixture optimisation
+        kl_mix, steps["search"] = fit.divergence, fit.steps  # 4: KL_mix
+    if kl_mix < eps:  # 5
+        branch, known = MIXTURE, state.explained(new, fit.weights)  # 6: keep w, no new strategy
+    else:  # 8
+        for _ in candidate().train():  # 9: train AIRL on tau_i: a policy and a strategy reward
+            pass
+        learned, steps["airl"] = candidate().policies.actor(), candidate().steps
+        kl_new = float(policy_divergences(learned, new, [*seed, 2, 9])[0])  # 10: KL_new
+        if kl_mix < kl_new:  # 11: then AIRL leaves no trace
+            branch, known = BETTER_MIXTURE, state.explained(new, fit.weights)  # 12: keep w, no new strategy
+        else:  # 14
+            branch = NEW_STRATEGY
+            known = state.with_strategy(new, candidate().networks())  # 15, 16: w = e_M+1, M = M + 1, m_M = i
+    decision = {"demonstration": n, "branch": branch, "kl_mix": kl_mix, "kl_new": kl_new, "threshold": eps}
+    decision |= {"reference": reference, "weights": known.weights[n], "n_strategies": known.n_strategies}
+    created = branch == NEW_STRATEGY
+    known, seen, played = play_round(known, created, eps, s, seed)  # 7, 13, 17: MSRD and BCD for all
+    spent = {**steps, "search": steps["search"] + played["search"], "msrd": played["msrd"]}
+    record = {**decision, **seen, "steps": spent, "seconds": time.perf_counter() - started}
+    return replace(known, records=(*state.records, plain(record)))
+
+
+def _candidate(state: State, new: DemonstrationSet, settings: DMSRDSettings, seed: list[int]) -> AIRL:
+    """AIRL on the new demonstration alone, cloned and not yet trained, beside the R_Task known so far."""
+    s = settings
+    nothing = Rewards(state.domain, 1, s.airl.discount, seed, s.msrd.alpha)  # its R_Task is zero
+    shared = state.rewards() if state.networks and s.add_task_reward else nothing
+    return AIRL(new, s.airl, seed, shared=shared)
+
+
+def reference_divergence(
+    new: DemonstrationSet, candidate: Callable[[], AIRL], settings: DMSRDSettings, seed: list[int]
+) -> float:
+    """How near a good explanation comes to a demonstration, without labels, in nats: eps lies ``kl_margin``
+    above it.
+
+    The divergence of the demonstration's trajectories from each other; the domain's own guess for a single
+    one. With ``matched_starts``, where these differ as much as strategies do, that of its clone's rollouts
+    from the same starts.
+    """
+    comparison = new.domain.comparison
+    if not comparison.matched_starts:
+        own = own_divergence(new.domain, new.observations[0])
+        return own if np.isfinite(own) else comparison.own_at_most
+    clone = candidate().clone or AIRL(new, replace(settings.airl, warm_start=True), seed).clone
+    assert clone is not None
+    return float(policy_divergences(clone, new, seed)[0])
+
+
+def _check(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> None:
+    name, known = state.domain.name, state.demonstrations
+    if new.domain.name != name:
+        raise InputError(f"a demonstration of {new.domain.name} arrived; expected one of {name}")
+    for array in ("observations", "actions") if known is not None else ():
+        before, now = (getattr(some, array).shape[1:] for some in (known, new))
+        if before != now:
+            expected = f"expected {before} (trajectories, steps, dimension) as before"
+            raise InputError(f"a demonstration with {array} of shape {now} arrived; {expected}")
+    coverage = settings.msrd.coverage
+    if state.networks and ("coverage.0" in state.networks) != coverage:
+        expected = "expected the same in both"
+        raise InputError(f"coverage is {coverage} in the settings, and not so in the state; {expected}")
+
+
+def _audited(state: State, settings: DMSRDSettings) -> State:
+    """With the KL and the recognition of everybody so far in the last record."""
+    everyone, seed = np.arange(len(state.weights)), [state.seed, 102, len(state.weights) - 1, 8]
+    kl = state.divergences(everyone, seed, settings.measured_rollouts)
+    audit = plain({"kl": kl, "recognized": state.recognized(everyone)})
+    return replace(state, records=(*state.records[:-1], {**state.records[-1], "audit": audit}))

@@ -1,0 +1,99 @@
+"""Multi-strategy reward distillation (MSRD): what all demonstrators want, and what each of them wants
+besides.
+
+``R_j(s) = R_Task(s) + alpha R_S-j(s)``; the AIRL loss of every strategy under its R_j plus ``alpha E|R_S-j|``
+on the policies' own states pushes what is common into R_Task. Paper: Equation 1; Chen, Paleja, Ghuy, Gombolay
+(2020).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dmsrd_lite.demonstrations import DemonstrationSet
+from dmsrd_lite.domains import InputError
+from dmsrd_lite.domains.domain import Seed
+from dmsrd_lite.learning.networks import to_tensor
+from dmsrd_lite.method.airl import AIRL, AIRLSettings
+from dmsrd_lite.method.between_class_discrimination import between_class_loss, recognized, relative_to_own
+
+Between = tuple[DemonstrationSet, np.ndarray, Sequence[int] | np.ndarray]  # all n, weights (n, M), pure (M,)
+
+
+@dataclass(frozen=True)
+class MSRDSettings(AIRLSettings):
+    alpha: float = 0.3  # of Equation 1, in the sum and in the penalty
+    between_class_weight: float = 10.0  # of Equation 4, where there are weights to discriminate by
+    between_class_relative: bool = (
+        True  # count each strategy reward from its own demonstration (``relative_to_own``)
+    )
+    between_class_batch: int = 128  # states of every demonstration per step
+    between_class_extra: int = 20  # most further discriminator updates after training (``settle``)
+
+
+class MSRD(AIRL):
+    """AIRL for labelled demonstrations, one per strategy, with a shared task reward: its gradient is the sum
+    over strategies.
+
+    ``between``: ``(demonstrations (n), weights (n, M), pure (M))`` adds between-class discrimination over all
+    n of them.
+    """
+
+    settings: MSRDSettings
+
+    def __init__(
+        self,
+        demonstrations: DemonstrationSet,
+        settings: MSRDSettings,
+        seed: Seed,
+        *,
+        networks: dict[str, torch.Tensor] | None = None,
+        between: Between | None = None,
+    ):
+        if not settings.alpha > 0:
+            raise InputError(f"alpha {settings.alpha!r}: expected a positive weight of the strategy rewards")
+        self.alpha, self.between = settings.alpha, None
+        super().__init__(demonstrations, settings, seed, networks=networks)
+        if between is not None:
+            everyone, weights, pure = between
+            x = to_tensor(self.domain.network_input(everyone.transitions()[0]))  # (n, steps, obs_dim)
+            self.between, self.everyone = (x, to_tensor(weights), torch.as_tensor(np.asarray(pure))), everyone
+
+    def regularizer(self, x_samples: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+        """``alpha sum_j E|R_S-j|`` on the policies' states, and Equation 4 where there are weights."""
+        loss = self.alpha * self.rewards.g(x_samples).abs().mean(1).sum()
+        if self.between is not None:
+            x, weights, pure = self.between
+            some = torch.from_numpy(rng.integers(0, x.shape[1], self.settings.between_class_batch))
+            states = x[:, some].reshape(1, -1, x.shape[-1]).expand(len(pure), -1, -1)
+            mean_rewards = self.rewards.g(states).view(len(pure), len(x), -1).mean(2)  # (M, n)
+            if self.settings.between_class_relative:
+                mean_rewards = relative_to_own(mean_rewards, pure)
+            loss = (
+                loss
+                + self.settings.between_class_weight * between_class_loss(mean_rewards, weights, pure).sum()
+            )
+        return loss
+
+    def settle(self) -> int:
+        """Update rewards on the samples at hand until each ranks its own demonstration first; how many
+        updates it took.
+
+        Asks only which demonstrations belong to which strategy: simulates nothing, and leaves policies and
+        R_Task alone.
+        """
+        self.rewards.task_reward.requires_grad_(False)
+        update, most = 0, self.settings.between_class_extra if self.between is not None and self.replay else 0
+        while update < most and not self.recognized().all():
+            self._discriminate([*self.seed, 20, update])
+            self._average()
+            update += 1
+        self.rewards.task_reward.requires_grad_(True)
+        return update
+
+    def recognized(self) -> np.ndarray:
+        """Which (averaged) strategy rewards rank their pure demonstration first among all, (M,) bool."""
+        assert self.between is not None
+        return recognized(self.averaged_rewards.mean_rewards(self.everyone), self.between[2].numpy())

@@ -1,0 +1,182 @@
+"""Policy mixtures: a demonstration explained as a blend of known strategies. Paper: Equations 2 and 3."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize, nnls
+
+from dmsrd_lite.demonstrations import DemonstrationSet
+from dmsrd_lite.domains import InputError
+from dmsrd_lite.domains.domain import Seed, extend
+from dmsrd_lite.learning.networks import Actor, Policies, one_thread
+from dmsrd_lite.method.divergence import policy_divergences
+
+
+def check_weights(weights: ArrayLike, n_strategies: int) -> np.ndarray:
+    """``weights`` as rows on the simplex, (K, n_strategies), or ``InputError``; one row may be flat."""
+    table = np.atleast_2d(np.asarray(weights, dtype=np.float64))
+    if n_strategies < 1 or table.size == 0:
+        raise InputError("a mixture of no strategies: expected at least one strategy and one row of weights")
+    if table.ndim != 2 or table.shape[1] != n_strategies:
+        expected = f"expected {n_strategies} weights in a row, one for each strategy"
+        raise InputError(f"mixture weights of shape {table.shape}: {expected}")
+    faulty = ~np.isfinite(table) | (table < -1e-9)
+    if faulty.any():
+        raise InputError(f"mixture weights {table[faulty][0]:g}: expected weights of at least 0")
+    wrong = np.abs(table.sum(1) - 1) > 1e-6
+    if wrong.any():
+        raise InputError(f"mixture weights that sum to {table[wrong][0].sum():g}: expected a sum of 1")
+    return np.maximum(table, 0.0)
+
+
+class Mixtures(Policies):
+    """K mixtures ``pi_w(a|s) = N(sum_j w_j mu_j(s), (sum_j w_j sigma_j)^2)`` of M policies, to act and to
+    score with.
+
+    Equation 2. One Gaussian around the weighted mean: what is executed is what the likelihood counts, and a
+    pure weight is the pure policy. weights (K, M).
+    """
+
+    def __init__(self, actor: Actor, weights: ArrayLike):
+        self.actor, self.weights = actor, check_weights(weights, actor.n_strategies).astype(np.float32)
+        self.sigma = np.einsum("km,mua->kua", self.weights, actor.sigma)  # (K, 1, action_dim)
+
+    def mean(self, observations: np.ndarray) -> np.ndarray:
+        k, e = observations.shape[:2]
+        means = self.actor.mean(observations.reshape(1, k * e, -1))  # (M, K * E, action_dim)
+        return np.einsum("km,mkea->kea", self.weights, means.reshape(-1, k, e, means.shape[-1]))
+
+
+@dataclass(frozen=True)
+class MixtureSettings:
+    n_candidates: int = 64  # drawn from the simplex, beside the pure strategies and the incumbent
+    n_refinements: int = 32  # drawn around the best of them
+    concentration: float = 40.0  # of the refinements: Dirichlet(concentration * best + 0.1)
+    search_rollouts: int = 2  # per candidate, to choose the finalists
+    n_finalists: int = 6
+    final_rollouts: int = 10  # of the protocol (``policy_divergences``)
+    from_actions: bool = (
+        False  # try ``likeliest_weights`` first; near enough, they save the search (beyond the paper)
+    )
+
+
+@dataclass(frozen=True)
+class MixtureFit:
+    """The best mixture: weights (M,), its divergence in nats on fresh rollouts, and what the search saw."""
+
+    weights: np.ndarray
+    divergence: float
+    candidates: np.ndarray  # (n, M)
+    divergences: np.ndarray  # (n,), of the few rollouts of the search
+    steps: int  # environment steps spent
+
+
+def inside_bounds(actor: Actor, demonstration: DemonstrationSet) -> tuple[np.ndarray, ...]:
+    """Actions (N,) of one demonstrator, and the actor's means and sigmas there (M, N), in half ranges.
+
+    Without those at a bound: an action there says only that at least so much was wished.
+    """
+    domain, actions = (
+        demonstration.domain,
+        demonstration.actions[0].reshape(-1, demonstration.domain.action_dim),
+    )
+    states = demonstration.observations[0, :, : demonstration.horizon].reshape(1, len(actions), -1)
+    low, high = np.array(domain.action_low), np.array(domain.action_high)
+    inside, means = (actions > low + 1e-6) & (actions < high - 1e-6), actor.mean(states)
+    sigmas = np.broadcast_to(actor.sigma, means.shape)
+    return tuple((x / domain.half_range)[..., inside] for x in (actions, means, sigmas))
+
+
+@one_thread()
+def regress_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
+    """The mixture whose means are nearest to what one demonstrator did: weights (M,), without a rollout.
+
+    ``min_w sum_t |a_t - sum_j w_j mu_j(s_t)|^2`` over the simplex, actions in half ranges.
+    """
+    a, mu, _ = (x.astype(np.float64) for x in inside_bounds(actor, demonstration))
+    one = 1e3 * np.sqrt(1 + len(a))  # a row that holds the sum of the weights at one
+    weights, _ = nnls(np.vstack([mu.T, np.full((1, len(mu)), one)]), np.append(a, one))
+    return weights / weights.sum()
+
+
+@one_thread()
+def likeliest_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
+    """The mixture under which one demonstrator's actions are the most likely: weights (M,), without a
+    rollout.
+
+    ``max_w sum_t log N(a_t; sum_j w_j mu_j(s_t), (sum_j w_j sigma_j)^2)`` over the simplex. Least squares if
+    all sigmas are equal; where they are not, how widely somebody acts tells the weights as well.
+    """
+    a, mu, sigma = (x.astype(np.float64) for x in inside_bounds(actor, demonstration))
+
+    def loss(w: np.ndarray) -> tuple[np.floating, np.ndarray]:
+        spread = w @ sigma
+        z = (a - w @ mu) / spread
+        return np.mean(np.log(spread) + z * z / 2), ((sigma * (1 - z * z) - mu * z) / spread).mean(1)
+
+    m = len(mu)
+    simplex = {"type": "eq", "fun": lambda w: w.sum() - 1, "jac": np.ones_like}
+    options: dict = {"bounds": [(0, 1)] * m, "constraints": simplex, "options": {"ftol": 1e-9}}
+    found = minimize(loss, np.full(m, 1 / m), jac=True, method="SLSQP", **options)
+    weights = np.clip(found.x, 0, None)
+    return weights / weights.sum()
+
+
+def search_mixture(
+    actor: Actor,
+    demonstration: DemonstrationSet,
+    settings: MixtureSettings,
+    seed: Seed,
+    *,
+    incumbent: ArrayLike | None = None,
+    enough: float = 0.0,
+) -> MixtureFit:
+    """Random search on the simplex for the mixture whose rollouts are nearest to one demonstration (a set of
+    one).
+
+    Equation 3. Candidates: the pure strategies, the incumbent, Dirichlet(1) draws, half of them cut down to
+    two or three strategies, then refinements around the best; each round is one batch of rollouts. The
+    finalists are measured by the protocol of every KL here, and the winner once more on rollouts of its own,
+    because the least of several noisy numbers is too low. With ``from_actions`` ``likeliest_weights`` are
+    measured first, and taken if they come below ``enough`` nats.
+    """
+    m, s, rng = actor.n_strategies, settings, np.random.default_rng(seed)
+    if demonstration.n_demonstrations != 1:
+        n = demonstration.n_demonstrations
+        raise InputError(
+            f"a mixture is searched for one demonstration at a time; expected a set of 1, not {n}"
+        )
+    drawn = rng.dirichlet(np.ones(m), s.n_candidates)
+    for row in drawn[::2]:  # half of them are sparse: few strategies in a mixture are the common case
+        kept = rng.permutation(m)[: 2 + rng.integers(2)]
+        row[np.setdiff1d(np.arange(m), kept)] = 0.0
+    drawn /= drawn.sum(1, keepdims=True)
+    given = np.eye(m) if incumbent is None else np.vstack([np.eye(m), check_weights(incumbent, m)[:1]])
+    candidates = np.vstack([given, drawn]) if m > 1 else given
+    steps = 0
+
+    def measure(weights: np.ndarray, part: int, n_rollouts: int) -> np.ndarray:
+        nonlocal steps
+        steps += len(weights) * n_rollouts * demonstration.horizon
+        mixtures = Mixtures(actor, weights)
+        return policy_divergences(mixtures, demonstration, extend(seed, part), n_rollouts=n_rollouts)
+
+    if s.from_actions and m > 1:
+        likeliest = likeliest_weights(actor, demonstration)[None]
+        divergences = measure(likeliest, 5, s.final_rollouts)
+        if divergences[0] < enough:
+            return MixtureFit(likeliest[0], float(divergences[0]), likeliest, divergences, steps)
+        candidates = np.vstack([candidates, likeliest])
+    divergences = measure(candidates, 1, s.search_rollouts)
+    if m > 1 and s.n_refinements:
+        around = rng.dirichlet(s.concentration * candidates[divergences.argmin()] + 0.1, s.n_refinements)
+        divergences = np.append(divergences, measure(around, 2, s.search_rollouts))
+        candidates = np.vstack([candidates, around])
+    finalists = np.argsort(divergences, kind="stable")[: s.n_finalists]
+    if incumbent is not None:
+        finalists = np.union1d(finalists, [m])
+    best = candidates[finalists[measure(candidates[finalists], 3, s.final_rollouts).argmin()]]
+    return MixtureFit(
+        best, float(measure(best[None], 4, s.final_rollouts)[0]), candidates, divergences, steps
+    )

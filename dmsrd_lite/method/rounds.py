@@ -1,0 +1,78 @@
+"""A round: after each demonstration all strategies train on. Paper: Algorithm 1, lines 7, 13 and 17."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dmsrd_lite.method.msrd import MSRD
+from dmsrd_lite.method.policy_mixture import search_mixture
+from dmsrd_lite.method.state import State
+
+if TYPE_CHECKING:
+    from dmsrd_lite.method.dmsrd import DMSRDSettings
+
+
+def play_round(
+    state: State, created: bool, threshold: float, settings: "DMSRDSettings", seed: list[int]
+) -> tuple[State, dict, dict[str, int]]:
+    """MSRD on the pure demonstrations, BCD on those remembered; mixtures that moved away are searched again.
+
+    ``created``: the newest demonstration is a strategy; ``threshold``: its eps. Returns the state; for the
+    record the KL of those remembered before and after, and who was searched again ({demonstration: [KL then,
+    KL now]}); and the steps. Declared deviations: BCD runs after every branch (line 17 names MSRD only); a
+    mixture is searched again (the paper keeps its weights), but only where its KL has risen above its eps.
+    """
+    s, newest, pure = settings, len(state.weights) - 1, state.pure
+    some = remembered(state, s.remembered, [*seed, 6])
+    thresholds = np.array([*(r["threshold"] for r in state.records), threshold])[some]
+    moving = s.policies_after_mixture or created  # else policies rest, and nobody's KL can change
+    steps = {"search": 0, "msrd": 0}
+    searched: dict[int, list[float]] = {}
+
+    def measure() -> np.ndarray:
+        return state.divergences(some, [*seed, 3], s.measured_rollouts) if moving else np.zeros(0)
+
+    before = after = measure()
+    if len(pure) > 1:
+        shown = state.shown.select(some), state.weights[some], np.searchsorted(some, pure)
+        between = shown if s.between_class else None
+        only = state.shown.select(pure)
+        learner = MSRD(only, s.msrd, [*seed, 4], networks=state.networks, between=between)
+        learner.n_averaged = s.msrd.n_iterations * sum(r["n_strategies"] > 1 for r in state.records)
+        learner.learns_policies = moving
+        for _ in learner.train():
+            pass
+        learner.settle()
+        state, steps["msrd"] = replace(state, networks=learner.networks()), learner.steps * len(pure)
+        after, weights, policies = measure(), state.weights.copy(), state.policies().actor()
+        for k in np.flatnonzero(after > thresholds[: len(after)]):  # its own strategies have moved away
+            if (i := int(some[k])) not in {*pure, newest}:
+                keywords = {"incumbent": weights[i], "enough": thresholds[k]}
+                fit = search_mixture(policies, state.shown.select([i]), s.mixture, [*seed, 5, i], **keywords)
+                searched[i], steps["search"] = [after[k], fit.divergence], steps["search"] + fit.steps
+                weights[i] = fit.weights if fit.divergence < after[k] else weights[i]
+        state = replace(state, weights=weights)
+    known = {
+        "remembered": some,
+        "kl_before_round": before,
+        "kl_after_round": after,
+        "searched_again": searched,
+    }
+    return state, {**known, "recognized": state.recognized(some)}, steps
+
+
+def remembered(state: State, n: int, seed: list[int]) -> np.ndarray:
+    """The demonstrations that a round works on: the pure ones, the newest, and ``n`` of the others (0: all),
+    sorted.
+
+    Of these first the one with the largest weight on each strategy, which its reward confuses most easily
+    with its own; the rest are drawn anew each time.
+    """
+    everyone = np.arange(len(state.weights))
+    others = np.setdiff1d(everyone, [*state.pure, everyone[-1]])
+    if not 0 < n < len(others):
+        return everyone
+    nearest = np.unique(others[state.weights[others].argmax(0)])[:n]
+    drawn = np.random.default_rng(seed).choice(np.setdiff1d(others, nearest), n - len(nearest), replace=False)
+    return np.union1d(np.setdiff1d(everyone, others), [*nearest, *drawn])

@@ -1,0 +1,50 @@
+"""JupyterLab on a copy of the lessons: what a reader changes there changes no file of the repository."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from dmsrd_lite.demonstrations import check_folder
+from dmsrd_lite.domains import InputError
+from dmsrd_lite.workbook.lessons import NOTEBOOKS
+from dmsrd_lite.workbook.records import ROOT
+
+MINE = ROOT / "my_notebooks"
+PANELS = ("assignment-list", "course-list", "create-assignment", "formgrader", "menu", "validate-assignment")
+CONFIG = {  # nbgrader's panels want a course and show errors without one; Markdown is to be read
+    "page_config.json": {"disabledExtensions": {f"@jupyter/nbgrader:{panel}": True for panel in PANELS}},
+    "default_setting_overrides.json": {
+        "@jupyterlab/docmanager-extension:plugin": {"defaultViewers": {"markdown": "Markdown Preview"}},
+        "@jupyter-widgets/jupyterlab-manager:plugin": {
+            "saveState": True
+        },  # a slider comes back with the notebook
+        "@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False},
+    },
+}
+
+
+def open_lab(as_root: bool = False) -> int:
+    """Copy the lessons to ``my_notebooks`` if need be, and open JupyterLab on them; its exit code."""
+    if hasattr(os, "geteuid") and os.geteuid() == 0 and not as_root:
+        text = (
+            "JupyterLab does not start as root: expected another user, or 'python -m dmsrd_lite lab --root'"
+        )
+        raise InputError(f"{text} ('make lab ROOT=--root') if you know that nobody else reaches this machine")
+    print(copy_lessons())
+    for name, content in CONFIG.items():
+        path = check_folder(Path(sys.prefix) / "etc/jupyter/labconfig" / name)
+        path.write_text(json.dumps(content))
+    page = f"--LabApp.default_url=/lab/tree/{MINE.name}/START.md"
+    command = [sys.executable, "-m", "jupyterlab", f"--ServerApp.root_dir={ROOT}", page]
+    return subprocess.call([*command, *(["--allow-root"] if as_root else [])])
+
+
+def copy_lessons(folder: Path = MINE) -> str:
+    """Copy the lessons once, never over what is there; says in a sentence where they are."""
+    if folder.exists():
+        return f"{folder}: your copy of the lessons, as you left it (move it away to get a fresh one)"
+    shutil.copytree(NOTEBOOKS, folder, ignore=shutil.ignore_patterns(".ipynb_checkpoints"))
+    return f"{folder}: your own copy of the lessons, ignored by git; notebooks/ stays as it is"

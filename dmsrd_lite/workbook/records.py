@@ -1,0 +1,110 @@
+"""Records of long runs, with what decides their numbers: settings, versions, a hash of the source."""
+
+import ast
+import dataclasses
+import hashlib
+import json
+import os
+import platform
+import re
+from collections.abc import Sequence
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmsrd_lite.demonstrations import plain, write_atomically
+from dmsrd_lite.domains import InputError
+
+PACKAGE = Path(__file__).resolve().parent.parent
+ROOT = PACKAGE.parent
+NOTEBOOKS = ROOT / "notebooks"
+RECORDS = ROOT / "papermill_runs" / "records"
+MIME = "application/vnd.dmsrd-lite.result+json"  # of what a notebook hands over
+DECIDING = (
+    "domains",
+    "learning",
+    "demonstrations.py",
+    "method",
+    "evaluation",
+    "demonstrators",
+    "workbook/presets.py",
+)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides the numbers."""
+    packages = [p for p in ("torch", "mujoco", "gymnasium", "numpy", "scipy") if find_spec(p)]
+    return {"python": platform.python_version(), **{p: version(p).split("+")[0] for p in packages}}
+
+
+def machine() -> dict[str, str | int]:
+    """What kind of machine this is."""
+    return {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count() or 1}
+
+
+def source_hash(cells: Sequence[str] = (), package: Path = PACKAGE) -> str:
+    """What decides a run's numbers: sha256 over the code of the package's ``DECIDING`` parts and of a
+    notebook's cells.
+
+    Over syntax trees: comments, docstrings, markdown and the rest of the workbook (figures, plans) do not
+    count.
+    """
+    paths = [path for part in DECIDING for path in sorted((package / part).rglob("*.py")) or [package / part]]
+    parts = [f"{path.relative_to(package)}: {_code(path.read_text())}" for path in paths]
+    return hashlib.sha256("\n".join([*parts, *map(_code, cells)]).encode()).hexdigest()[:16]
+
+
+def _code(text: str) -> str:
+    try:
+        tree = ast.parse(text)
+    except SyntaxError:  # a cell with magics
+        return text
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+            and ast.get_docstring(node) is not None
+        ):
+            node.body = node.body[1:]
+    return ast.dump(tree)
+
+
+def settings_of(settings: Any) -> Any:
+    """Settings as they stand in a record: names and plain values."""
+    return plain(dataclasses.asdict(settings))
+
+
+def save_record(
+    name: str,
+    parameters: dict,
+    settings: Any,
+    results: dict,
+    tensors: dict[str, np.ndarray],
+    folder: Path = RECORDS,
+) -> Path:
+    """Write ``name.json`` (parameters, settings, versions, machine, results) and ``name.safetensors``."""
+    from safetensors.numpy import save
+
+    made_with = {"settings": settings_of(settings), "versions": versions(), "machine": machine()}
+    record = {"name": name, "parameters": parameters, **made_with, "results": results}
+    text = json.dumps(plain(record), indent=1)
+    one_line = r"\[\n\s+([^\[\]{}]*?)\n\s+\]"  # a list a line
+    text = re.sub(one_line, lambda m: "[" + re.sub(r"\s*\n\s*", " ", m[1]) + "]", text)
+    binary = save({k: np.ascontiguousarray(v) for k, v in tensors.items()})
+    write_atomically(folder / f"{name}.safetensors", lambda f: f.write(binary))
+    return write_atomically(folder / f"{name}.json", lambda f: f.write((text + "\n").encode()))
+
+
+def load_record(name: str, folder: Path = RECORDS) -> tuple[dict, dict[str, np.ndarray]]:
+    """A record and its networks; ``InputError`` when it is missing or cannot be read."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    path = folder / f"{name}.json"
+    try:
+        return json.loads(path.read_text()), load_file(path.with_suffix(".safetensors"))
+    except (OSError, ValueError, SafetensorError) as error:
+        expected = "expected a record and its .safetensors file"
+        raise InputError(f"{path}: cannot be read ({type(error).__name__}); {expected}") from None

@@ -1,0 +1,74 @@
+"""Every method goes through the same door, and what it learned can be stored and scored again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+from helpers import make_truth
+
+from dmsrd_lite.domains import InputError
+from dmsrd_lite.evaluation import comparison
+from dmsrd_lite.evaluation.comparison import METHODS, MethodSettings, score_method, train_method
+from dmsrd_lite.evaluation.metrics import reward_correlation
+from dmsrd_lite.method.dmsrd import learn
+from dmsrd_lite.method.state import State
+
+SETTINGS = {"ours": MethodSettings(tiny.AIRL_ONE, tiny.MSRD_ONE, tiny.TINY)}
+SETTINGS["paper"] = SETTINGS["ours"].as_in_the_paper()
+RUNS = [("cloning", "ours"), *((method, variant) for method in METHODS[1:] for variant in SETTINGS)]
+SCORES = ("divergence", "log_likelihood_per_step", "task_correlation", "recognized", "environment_return")
+
+
+@pytest.mark.parametrize(("method", "variant"), RUNS)
+@pytest.mark.parametrize("given", ["small_set", pytest.param("lander_set", marks=pytest.mark.verify)])
+def test_what_is_stored_scores_the_same(given, method, variant, request):
+    shown = request.getfixturevalue(given)
+    shown = replace(shown, domain=shown.domain.on_threads(1))
+    truth, learned = make_truth(shown.domain), train_method(method, shown, SETTINGS[variant], 0)
+    scores = score_method(learned, shown, shown, truth, [0, 9])
+    assert learned.weights.shape == (2, learned.policies.n_strategies)
+    assert learned.weights.sum(1) == pytest.approx([1, 1])
+    stored = comparison.restore(
+        learned.tensors(), shown, getattr(learned.rewards, "alpha", 0.0), learned.pure
+    )
+    again = score_method(stored, shown, shown, truth, [0, 9])
+    for score in SCORES:
+        assert scores[score] == pytest.approx(again[score], nan_ok=True), score
+    if method != "cloning" and np.isfinite(scores["task_correlation"]):
+        part = learned.rewards.evaluate(truth.observations, learned.task_part).mean(2)
+        by_hand = np.mean([reward_correlation(p, truth.returns) for p in part])
+        assert scores["task_correlation"] == pytest.approx(by_hand)
+    assert (method == "cloning") == (learned.rewards is None)
+    assert scores["recognized"] == scores["recognized_again"] or method in ("cloning", "AIRL Batch")
+
+
+def test_a_method_spends_what_its_settings_and_records_say(small_set):
+    assert train_method("cloning", small_set, SETTINGS["ours"], 0).steps == 0
+    coverage, two_iterations, two_users = 3 * 50, 2 * 50, 2
+    ours, paper = (
+        train_method("AIRL Single", small_set, settings, 0).steps for settings in SETTINGS.values()
+    )
+    assert (ours, paper) == (two_users * (coverage + two_iterations), two_users * two_iterations)
+    *_, state = learn(State(small_set.domain, 0), small_set, tiny.TINY)
+    learned, spent = comparison.learned_by(state), [record["steps"] for record in state.records]
+    assert learned.steps == sum(s["airl"] + s["msrd"] for s in spent) > 0
+    assert learned.search_steps == sum(s["search"] for s in spent) > 0
+    assert np.array_equal(learned.weights, state.weights)
+    assert (learned.task_part, learned.pure) == ("task", state.pure)
+
+
+def test_as_in_the_paper_switches_three_things_off_everywhere():
+    ours, paper = SETTINGS.values()
+    for changed, usual in ((paper, ours), (paper.dmsrd, ours.dmsrd)):
+        for part in ("airl", "msrd"):
+            settings = getattr(changed, part)
+            assert (settings.warm_start, settings.cloning_weight, settings.coverage) == (False, 0.0, False)
+            back = replace(settings, warm_start=True, cloning_weight=1.0, coverage=True)
+            assert back == getattr(usual, part), "and nothing else"
+    assert (paper.dmsrd.add_task_reward, ours.dmsrd.add_task_reward) == (False, True)
+
+
+def test_unknown_method(small_set):
+    with pytest.raises(InputError, match="unknown method 'GAIL': expected one of cloning, AIRL Single"):
+        train_method("GAIL", small_set, SETTINGS["ours"], 0)

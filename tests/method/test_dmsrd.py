@@ -1,0 +1,254 @@
+import inspect
+import json
+import re
+from collections import Counter
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from helpers import assert_decisions_follow
+from tiny import GENEROUS, PENDULUM, ROUGH, TINY, after, assert_same, copied, everything, forbid, same, watch
+
+from dmsrd_lite.domains import LUNAR_LANDER, InputError
+from dmsrd_lite.method import airl, divergence, dmsrd, rounds
+from dmsrd_lite.method.state import State
+
+WITHOUT_COVERAGE = {name: replace(getattr(ROUGH, name), coverage=False) for name in ("airl", "msrd")}
+FIELDS = """demonstration branch kl_mix kl_new threshold reference weights n_strategies steps seconds
+remembered kl_before_round kl_after_round searched_again recognized"""
+
+
+def answer_with(monkeypatch, *, kl_mix=None, kl_new=None):
+    """Let the search or the new strategy come out with a given divergence."""
+    search = dmsrd.search_mixture
+    if kl_mix is not None:
+        found = lambda *a, **k: replace(search(*a, **k), divergence=kl_mix)  # noqa: E731
+        monkeypatch.setattr(dmsrd, "search_mixture", found)
+    if kl_new is not None:
+        monkeypatch.setattr(dmsrd, "policy_divergences", lambda *_: np.array([kl_new]))
+
+
+def test_the_loop_fits_a_screen_and_carries_the_papers_line_numbers():
+    source = inspect.getsource(dmsrd.learn_one)
+    assert len(source.splitlines()) <= 45
+    told = re.findall(r"# (\d+(?:, \d+)*)(?::|$)", source, re.MULTILINE)
+    found = [[int(n) for n in numbers.split(", ")] for numbers in told]
+    assert sorted(n for numbers in found for n in numbers) == list(range(3, 18))
+    assert found == [*sorted(found[:-1]), [7, 13, 17]], "in the paper's order, and the rounds at the end"
+
+
+def test_the_first_demonstration_makes_the_first_strategy(three, monkeypatch):
+    forbid(monkeypatch, (rounds, "MSRD"), (dmsrd, "search_mixture"))
+    made = watch(monkeypatch, dmsrd, "AIRL")
+    state = after(State(PENDULUM, 0), three.select([0]))
+    (record,) = state.records
+    assert [record[k] for k in ("branch", "kl_mix", "weights", "recognized")] == [
+        "new strategy", None, [1.0], [True]]  # fmt: skip
+    assert record["steps"] == {"search": 0, "airl": 50 + 3 * 50, "msrd": 0}
+    assert (state.weights.tolist(), state.pure, state.n_strategies) == ([[1.0]], (0,), 1)
+    assert same(state.networks, made[0]["learner"].networks())
+    assert not state.rewards().evaluate(three.observations, "task").any()
+
+
+@pytest.mark.parametrize(
+    ("kl_mix", "kl_new", "branch"),
+    [
+        (1.9, None, "mixture"),
+        (2.0, 3.0, "mixture, better than a new strategy"),  # the paper: the mixture where KL_mix < eps
+        (3.0, 2.1, "new strategy"),
+        (3.0, 3.0, "new strategy"),  # the paper: the mixture where KL_mix < KL_new
+    ],
+)
+def test_decisions_by_hand(kl_mix, kl_new, branch, three, states, monkeypatch):
+    answer_with(monkeypatch, kl_mix=kl_mix, kl_new=kl_new)
+    if kl_new is None:
+        forbid(monkeypatch, (dmsrd, "AIRL"), (rounds, "MSRD"))
+    state = after(states[1], three.select([1]), replace(ROUGH, kl_threshold=2.0))
+    record, created = state.records[1], branch == "new strategy"
+    assert (record["branch"], record["kl_mix"], record["kl_new"]) == (branch, kl_mix, kl_new)
+    assert record["n_strategies"] == len(state.rewards().evaluate(np.zeros(4))) == 1 + created
+    assert state.pure == ((0, 1) if created else (0,))
+    assert state.weights.tolist() == ([[1, 0], [0, 1]] if created else [[1], [1]])
+    assert record["steps"]["search"] == 50 * (1 + 2 + 2)
+    assert [record["steps"][k] > 0 for k in ("airl", "msrd")] == [kl_new is not None, created]
+    assert same(state.networks, states[1].networks) != created, "one strategy alone has no round"
+
+
+def test_a_rejected_airl_leaves_no_trace(three, states, monkeypatch):
+    """Two strategies, a third demonstration: all goes on as if its mixture had been near, without AIRL."""
+    given = watch(monkeypatch, rounds, "MSRD")
+    with monkeypatch.context() as patch:
+        forbid(patch, (dmsrd, "AIRL"))
+        without = after(states[2], three.select([2]), GENEROUS)
+    answer_with(monkeypatch, kl_mix=2e9, kl_new=float("inf"))
+    rejected = after(states[2], three.select([2]), GENEROUS)
+    assert [s.records[2]["branch"] for s in (without, rejected)] == [dmsrd.MIXTURE, dmsrd.BETTER_MIXTURE]
+    assert rejected.records[2]["steps"]["airl"] > 0
+    assert all(same(one["networks"], states[2].networks) for one in given)
+    assert same(everything(without), everything(rejected))
+    assert not same(rejected.networks, states[2].networks), "the round must have moved them"
+    for name in ("weights", "kl_before_round", "kl_after_round", "searched_again", "recognized"):
+        assert without.records[2][name] == rejected.records[2][name]
+
+
+@pytest.mark.parametrize("add_task_reward", [True, False])
+def test_the_task_reward_is_added_to_what_a_new_strategy_learns(add_task_reward, three, states, monkeypatch):
+    made = watch(monkeypatch, dmsrd, "AIRL")
+    after(states[2], three.select([2]), replace(ROUGH, add_task_reward=add_task_reward))
+    known = states[2].rewards().evaluate(three.observations, "task")
+    added = made[0]["learner"].rewards.evaluate(three.observations, "task")
+    assert known.any()
+    assert made[0]["learner"].alpha == TINY.msrd.alpha
+    assert np.array_equal(added, known) if add_task_reward else not added.any()
+
+
+def test_records_say_everything_in_json(states):
+    records = states[3].records
+    assert_decisions_follow(records, states[3].n_strategies)
+    assert [states[n].records for n in range(4)] == [records[:n] for n in range(4)]
+    for n, record in enumerate(records):
+        assert sorted(record) == sorted(FIELDS.split())
+        assert json.loads(json.dumps(record, allow_nan=False)) == record
+        m = states[n + 1].n_strategies
+        assert (record["demonstration"], record["n_strategies"], record["threshold"]) == (n, m, 1e-3)
+        assert len(record["kl_before_round"]) == len(record["kl_after_round"]) == n + 1
+        assert len(record["weights"]) == len(record["recognized"]) == m
+        assert sum(record["weights"]) == pytest.approx(1)
+        assert record["seconds"] > 0
+
+
+def test_steps_are_those_of_the_simulator(three, states, monkeypatch):
+    """Of the learners and the searches; the rollouts that only measure a KL are not counted."""
+    simulated, searched, rollout, search = Counter(), [], airl.rollout, dmsrd.search_mixture
+
+    def counting(module, *arguments, **keywords):
+        data = rollout(*arguments, **keywords)
+        simulated[module] += data.n_steps
+        return data
+
+    def searching(*arguments, **keywords):
+        before, fit = simulated[divergence], search(*arguments, **keywords)
+        searched.append(simulated[divergence] - before)
+        return fit
+
+    for module in (airl, divergence):
+        monkeypatch.setattr(module, "rollout", partial(counting, module))
+    for module in (dmsrd, rounds):
+        monkeypatch.setattr(module, "search_mixture", searching)
+    steps = after(states[2], three.select([2]), ROUGH).records[2]["steps"]
+    assert steps["airl"] + steps["msrd"] == simulated[airl] > steps["airl"] > 0
+    assert 0 < steps["search"] == sum(searched) < simulated[divergence]
+
+
+def test_the_threshold_is_calibrated_by_the_demonstration_itself(three, domain):
+    a, b = three.observations[0, :, 1:]
+    settings = replace(ROUGH, kl_threshold=0.0, kl_margin=0.75)
+    arrays = {k: v[:, :1] for k, v in three.select([0]).arrays().items() if k != "strategy_labels"}
+    single = replace(three, strategy_labels=None, **arrays)
+    own = (divergence.knn_divergence(a, b) + divergence.knn_divergence(b, a)) / 2
+    for shown, reference in ((three.select([0]), own), (single, domain.comparison.own_at_most)):
+        (record,) = after(State(PENDULUM, 0), shown, settings).records
+        assert record["reference"] == pytest.approx(reference)
+        assert record["threshold"] == record["reference"] + 0.75
+
+
+@pytest.mark.parametrize("warm", [True, False])
+def test_on_the_lander_the_clone_calibrates_the_threshold(lander_set, warm, monkeypatch):
+    made, lander = watch(monkeypatch, dmsrd, "AIRL"), LUNAR_LANDER.on_threads(1)
+    first = replace(lander_set.select([0]), domain=lander)
+    parts = {k: replace(getattr(ROUGH, k), warm_start=warm, coverage=warm) for k in ("airl", "msrd")}
+    (record,) = after(State(lander, 0), first, replace(TINY, kl_threshold=0.0, **parts)).records
+    assert len(made) == (1 if warm else 2), "the clone that AIRL starts from is the one that calibrates"
+    clone = made[-1]["learner"].clone
+    assert record["reference"] == divergence.policy_divergences(clone, first, [0, 102, 0, 7])[0]
+    assert record["threshold"] == record["reference"] + TINY.kl_margin
+
+
+BAD_SETTINGS = [
+    *(({"kl_threshold": bad}, f"kl_threshold {bad}: expected a positive number of nats, or 0 to calibrate it")
+      for bad in (-0.1, float("nan"), float("inf"))),
+    *(({name: part}, "coverage is on in only one of airl and msrd: expected both or neither, because")
+      for name, part in WITHOUT_COVERAGE.items()),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "sentence"), BAD_SETTINGS)
+def test_bad_settings_are_refused_in_one_sentence(change, sentence):
+    with pytest.raises(InputError, match=f"^{sentence}[^\n]*$"):
+        replace(TINY, **change)
+
+
+def test_without_coverage(three, states):
+    state = after(states[0], three.select([0]), replace(TINY, **WITHOUT_COVERAGE))
+    assert state.networks.keys() == {name for name in states[1].networks if not name.startswith("coverage.")}
+    assert state.records[0]["steps"]["airl"] == 50
+    with pytest.raises(InputError, match=r"^coverage is True in the settings, and not so in the state; exp"):
+        after(state, three.select([1]))
+
+
+def test_same_seed_same_bits_for_any_number_of_threads(three, states):
+    domain = PENDULUM.on_threads(2)
+    assert_same(after(State(domain, 0), replace(three.select([0, 1]), domain=domain)), states[2])
+    assert not same(after(State(PENDULUM, 1), three.select([0])).networks, states[1].networks)
+
+
+def test_learning_is_a_function_of_its_arguments_alone(three, states):
+    """No state, no demonstration and no global generator changes; any earlier state can be gone on from."""
+
+    def world():
+        generators = {"numpy": np.random.get_state()[1].copy(), "torch": torch.get_rng_state()}  # noqa: NPY002
+        return generators | {k: v.copy() for k, v in three.arrays().items()}
+
+    torch.manual_seed(7)  # unlike any that a careless line would set
+    before, known, records = world(), copied(states[1]), json.dumps(states[1].records)
+    after(states[1], three.select([1, 2]), GENEROUS)  # other settings leave nothing behind
+    assert_same(after(states[1], three.select([1])), states[2])
+    assert same(world(), before)
+    assert same(everything(states[1]), known)
+    assert json.dumps(states[1].records) == records
+
+
+def test_an_interruption_changes_nothing(three, states, monkeypatch):
+    before = copied(states[2])
+    for fault in ((dmsrd, "search_mixture"), (dmsrd, "AIRL"), (rounds, "MSRD")):
+        with monkeypatch.context() as patch:
+            forbid(patch, fault)
+            with pytest.raises(AssertionError, match="must not be made"):
+                after(states[2], three.select([2]), ROUGH)
+        assert same(everything(states[2]), before)
+
+
+BAD = {
+    "other domain": (lambda d: replace(d, domain=replace(d.domain, name="other")),
+        "a demonstration of other arrived; expected one of inverted_pendulum"),
+    "shorter": (lambda d: replace(d, observations=d.observations[:, :, :-10], actions=d.actions[:, :, :-10]),
+        r"a demonstration with observations of shape \(2, 41, 4\) arrived; expected \(2, 51, 4\)"),
+    "fewer": (lambda d: replace(d, observations=d.observations[:, :1], actions=d.actions[:, :1]),
+        r"a demonstration with observations of shape \(1, 51, 4\) arrived; expected \(2, 51, 4\)"),
+    "last successor unknown": (lambda d: replace(d, actions=d.actions[:, :, [*range(50), 49]]),
+        r"a demonstration with actions of shape \(2, 51, 1\) arrived; expected \(2, 50, 1\) .* as before"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_a_bad_demonstration_is_refused_in_one_sentence(fault, three, states):
+    spoil, sentence = BAD[fault]
+    bare = replace(three.select([2]), rewards=None, reset_seeds=None)
+    with pytest.raises(InputError, match=f"^{sentence}[^\n]*$"):
+        after(states[2], spoil(bare))
+
+
+def test_optional_fields_may_be_missing(three, states):
+    bare = replace(three.select([2]), rewards=None, strategy_labels=None, reset_seeds=None)
+    state = after(states[2], bare)
+    assert state.shown.arrays().keys() == {"observations", "actions"}
+    assert same(state.networks, states[3].networks), "nothing is learned from them"
+
+
+def test_an_audit_measures_everybody(three, states):
+    state = after(states[2], three.select([2, 2]), replace(GENEROUS, remembered=1, audit_every=2))
+    assert "audit" not in state.records[2]
+    kl, recognized = state.divergences(range(4), [0, 102, 3, 8], 2), state.recognized(range(4))
+    assert state.records[3]["audit"] == {"kl": kl.tolist(), "recognized": recognized.tolist()}
