@@ -118,7 +118,7 @@ def choose_demonstrators(
         pick = most_distinct(np.where(np.minimum(nearness, nearness.T) < 0, nearness, look), n_kept)
         smallest = table[np.ix_(pick, pick)][~np.eye(n_kept, dtype=bool)].min()
         kept = kept[pick]
-    if smallest < least:
+    if smallest < least or len(pick) < n_kept:
         raise InputError(
             f"only {fits.sum()} of {len(fits)} demonstrators of {domain.name} with seed {seed} succeeded, "
             f"the nearest two kept {smallest:.1f} nats apart; expected {n_kept} at least {least} apart"

@@ -104,12 +104,16 @@ def slider(draw: Callable[..., Any], **controls: Any) -> None:
         name: interactive.widget_from_abbrev(control, defaults[name]) for name, control in controls.items()
     }
 
+    class Sliders(HBox):
+        def __repr__(self) -> str:  # what a reader sees without a kernel
+            return f"Run this cell to move its sliders: {', '.join(widgets)}."
+
     def shown() -> Any:
         answer = draw(**{**defaults, **{name: widget.value for name, widget in widgets.items()}})
         plt.close("all")  # or it would be shown twice
         return figures.Text(answer) if isinstance(answer, str) else answer
 
-    display(HBox(list(widgets.values())))
+    display(Sliders(list(widgets.values())))
     handle = display(shown(), display_id=True)
     for name, widget in widgets.items():
         widget.description, widget.continuous_update = name, False

@@ -279,8 +279,8 @@ def _put(settings: Any, name: str, knob: Knob, path: list[str], value: Any) -> A
     if rest:
         return replace(settings, **{first: _put(now, name, knob, rest, value)})
     whole = isinstance(now, int)
-    fits = isinstance(value, int if whole else int | float) and knob.least <= value <= knob.most
-    if not fits:
+    if not (isinstance(value, int if whole else int | float) and knob.least <= value <= knob.most):
         expected = f"expected a {'whole ' if whole else ''}number from {knob.least:g} to {knob.most:g}"
-        raise InputError(f"{name} {value!r}: {expected}{', or 0: by preset' if knob.default == 0 else ''}")
+        by_preset = ", or 0: by preset" if knob.default == 0 and not isinstance(now, bool) else ""
+        raise InputError(f"{name} {value!r}: {expected}{by_preset}")
     return replace(settings, **{first: type(now)(value)})

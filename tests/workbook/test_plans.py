@@ -73,9 +73,9 @@ def stamps():
 
 
 def kills_its_worker(*seeds, times=1):
-    """A cell that kills the kernel's parent, so many times."""
-    n_begun = "open('begun').read().split().count(str(seed))"
-    return f"if seed in {seeds} and {n_begun} <= {times}:\n    os.kill(os.getppid(), 9); time.sleep(60)"
+    """A cell that kills the worker which started its kernel, so many times."""
+    condition = f"seed in {seeds} and open('begun').read().split().count(str(seed)) <= {times}"
+    return f"if {condition}:\n    os.kill(int(os.environ['JPY_PARENT_PID']), 9); time.sleep(60)"
 
 
 def wait_for(condition):
