@@ -5,7 +5,7 @@ CODE := dmsrd_lite tests notebooks
 .PHONY: workbook test verify lab lint lock results
 
 workbook: .venv/installed
-	$(BIN)/python -m dmsrd_lite run papermill_runs/plans/quick.toml
+	$(BIN)/python -m dmsrd_lite run papermill_runs/plans/quick.toml --workers 2
 
 test: .venv/installed lint
 	$(BIN)/python -m pytest -m "not verify" -n 2 --maxschedchunk 1

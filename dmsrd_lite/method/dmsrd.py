@@ -1,7 +1,7 @@
 """Dynamic multi-strategy reward distillation: demonstrations arrive one by one. Paper: Algorithm 1."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
@@ -10,7 +10,8 @@ import numpy as np
 from dmsrd_lite.demonstrations import DemonstrationSet, plain
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.method.airl import AIRL, AIRLSettings, Rewards
-from dmsrd_lite.method.divergence import own_divergence, policy_divergences
+from dmsrd_lite.method.divergence import policy_divergences
+from dmsrd_lite.method.kl_threshold import calibrate_threshold
 from dmsrd_lite.method.msrd import MSRDSettings
 from dmsrd_lite.method.policy_mixture import MixtureSettings, search_mixture
 from dmsrd_lite.method.rounds import play_round
@@ -24,7 +25,7 @@ class DMSRDSettings:
     kl_threshold: float = (
         0.0  # eps: accept a mixture below this divergence (nats); 0: a reference + kl_margin
     )
-    kl_margin: float = 0.5  # nats above the reference (``reference_divergence``)
+    kl_margin: float = 0.5  # nats above the reference (``kl_threshold.reference_divergence``)
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
     between_class: bool = True
     airl: AIRLSettings = AIRLSettings(n_iterations=12)
@@ -68,8 +69,7 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
     candidate = cache(
         partial(_candidate, state, new, s, [*seed, 2])
     )  # AIRL on tau_i, made when it is asked for
-    reference = reference_divergence(new, candidate, s, [*seed, 7])
-    eps = s.kl_threshold or reference + s.kl_margin
+    eps, reference = calibrate_threshold(new, candidate, s, [*seed, 7])
     kl_mix = kl_new = float("inf")
     if state.n_strategies:
         policies = state.policies().actor()
@@ -102,25 +102,6 @@ def _candidate(state: State, new: DemonstrationSet, settings: DMSRDSettings, see
     nothing = Rewards(state.domain, 1, s.airl.discount, seed, s.msrd.alpha)  # its R_Task is zero
     shared = state.rewards() if state.networks and s.add_task_reward else nothing
     return AIRL(new, s.airl, seed, shared=shared)
-
-
-def reference_divergence(
-    new: DemonstrationSet, candidate: Callable[[], AIRL], settings: DMSRDSettings, seed: list[int]
-) -> float:
-    """How near a good explanation comes to a demonstration, without labels, in nats: eps lies ``kl_margin``
-    above it.
-
-    The divergence of the demonstration's trajectories from each other; the domain's own guess for a single
-    one. With ``matched_starts``, where these differ as much as strategies do, that of its clone's rollouts
-    from the same starts.
-    """
-    comparison = new.domain.comparison
-    if not comparison.matched_starts:
-        own = own_divergence(new.domain, new.observations[0])
-        return own if np.isfinite(own) else comparison.own_at_most
-    clone = candidate().clone or AIRL(new, replace(settings.airl, warm_start=True), seed).clone
-    assert clone is not None
-    return float(policy_divergences(clone, new, seed)[0])
 
 
 def _check(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> None:

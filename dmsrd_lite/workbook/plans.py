@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import re
+import signal
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -170,21 +171,22 @@ def _client(n_workers: int, scheduler: str) -> Any:
     """A Dask client: of processes with one thread each on this machine, or of a scheduler somewhere."""
     from distributed import Client
 
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # we say it in a sentence
-    deaf = "import signal; signal.signal(signal.SIGINT, lambda *_: None)"  # Ctrl-C is for the driver alone
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    deaf = "from signal import *; signal(SIGINT, lambda *_: None); pthread_sigmask(SIG_UNBLOCK, [SIGINT])"
     here = {"n_workers": n_workers, "threads_per_worker": 1, "memory_limit": 0, "preload": [deaf],
             "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}  # fmt: skip
-    try:
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for the driver alone: a worker
+    try:  # starts with it blocked, and is deaf when its preload lets it through again (for the kernel's sake)
         return Client(scheduler, timeout=10) if scheduler else Client(**here)
     except Exception as error:  # unknown protocols, answers of something else: each has its own
         text = f"no Dask scheduler answers ({type(error).__name__}); expected one like tcp://host:8786"
         raise InputError(f"{scheduler or 'this machine'}: {text}") from None
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-def run_plan(
-    plan: Plan, *, workers: int = 0, scheduler: str = "", only: Sequence[str] = (), force: bool = False,
-    dry_run: bool = False,
-) -> bool:  # fmt: skip
+def run_plan(plan: Plan, *, workers: int = 0, scheduler: str = "", only: Sequence[str] = (),
+             force: bool = False, dry_run: bool = False) -> bool:  # fmt: skip
     """Run what is left of a plan, record by record, and say what was done; True when no run of it failed."""
     chosen = [run for run in plan.runs if all(_has(run, pair) for pair in only)]
     if not chosen:
@@ -226,8 +228,8 @@ def _perform(plan: Plan, todo: list[Run], workers: int, scheduler: str) -> None:
     n_workers = min(workers or max(1, (os.cpu_count() or 2) // 2), len(todo))  # a lesson uses two cores
     try:
         with lock, _client(n_workers, scheduler) as client:
-            place = plan.cell_seconds, os.getcwd()
-            waiting = {client.submit(perform, run, *place, pure=False): run for run in todo}
+            sent = (client.submit(perform, r, plan.cell_seconds, os.getcwd(), pure=False) for r in todo)
+            waiting = dict(zip(sent, todo, strict=True))
             for future in tqdm(as_completed(list(waiting)), total=len(todo), unit="run", smoothing=0):
                 answer = {"error": in_one_line(future.exception())} if future.exception() else future.result()
                 _record(plan, waiting.pop(future), answer)

@@ -44,14 +44,18 @@ def _for_test_sets(usual: DiaynSettings) -> DiaynSettings:
 
 TEST_SETS = {name: _for_test_sets(usual) for name, usual in DEMONSTRATORS.items()}
 
+# The search for a mixture (Equation 3): candidates, then refinements around the best of them.
+MIXTURE = {PENDULUM: MixtureSettings(64, 32), LANDER: MixtureSettings(64, 32)}
+QUICK_MIXTURE = MixtureSettings(24, 16, n_finalists=5)
+
 # The methods of the comparison. Lander: as many updates of R_Task as DMSRD makes in all; more make it worse.
 _LANDER_ROUND = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=6)
 METHODS = {
-    PENDULUM: MethodSettings(),
+    PENDULUM: MethodSettings(dmsrd=DMSRDSettings(mixture=MIXTURE[PENDULUM])),
     LANDER: MethodSettings(
         msrd=MSRDSettings(n_iterations=25, discriminator_steps=10),
         batch_steps=10,
-        dmsrd=DMSRDSettings(kl_margin=1.0, msrd=_LANDER_ROUND),
+        dmsrd=DMSRDSettings(kl_margin=1.0, msrd=_LANDER_ROUND, mixture=MIXTURE[LANDER]),
     ),
 }
 
@@ -218,7 +222,7 @@ LESSONS: dict[str, Any] = {  # (domain, quick) -> settings
     "03_msrd": lambda domain, quick: MSRDLesson(_users(quick), MSRDSettings(
         n_iterations=9 if quick else 25, discriminator_steps=24, **_small(quick, 8))),
     "04_policy_mixture": lambda domain, quick: MixtureLesson(
-        (0, 1), 0.5, MixtureSettings(24, 16, n_finalists=5) if quick else MixtureSettings()),
+        (0, 1), 0.5, QUICK_MIXTURE if quick else MIXTURE[domain]),
     "05_between_class_discrimination": lambda domain, quick: DiscriminationLesson(
         _users(quick), 2 if quick else 5,
         MSRDSettings(n_iterations=9 if quick else 20, discriminator_steps=24, **_small(quick, 4))),
@@ -279,7 +283,8 @@ def _put(settings: Any, name: str, knob: Knob, path: list[str], value: Any) -> A
     if rest:
         return replace(settings, **{first: _put(now, name, knob, rest, value)})
     whole = isinstance(now, int)
-    if not (isinstance(value, int if whole else int | float) and knob.least <= value <= knob.most):
+    fits = isinstance(value, int if whole else int | float) and knob.least <= value <= knob.most
+    if not fits or (isinstance(value, bool) and not isinstance(now, bool)):
         expected = f"expected a {'whole ' if whole else ''}number from {knob.least:g} to {knob.most:g}"
         by_preset = ", or 0: by preset" if knob.default == 0 and not isinstance(now, bool) else ""
         raise InputError(f"{name} {value!r}: {expected}{by_preset}")

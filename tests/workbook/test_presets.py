@@ -58,11 +58,10 @@ def test_a_parameter_changes_its_own_setting_and_nothing_at_its_default(lesson, 
 
 @pytest.mark.parametrize(("lesson", "name"), EVERY_KNOB)
 def test_what_it_may_not_be_is_one_sentence(lesson, name):
-    knob, whole = (
-        KNOBS[lesson][name],
-        isinstance(at(LESSONS[lesson]("lunar_lander", True), KNOBS[lesson][name].path), int),
-    )
-    for bad in (-7, knob.most * 2 + 1, "many", None, float("nan"), *([knob.least + 0.5] if whole else [])):
+    knob = KNOBS[lesson][name]
+    now = at(LESSONS[lesson]("lunar_lander", True), knob.path)
+    halves, switches = [knob.least + 0.5] * isinstance(now, int), [True] * (not isinstance(now, bool))
+    for bad in (-7, knob.most * 2 + 1, "many", None, float("nan"), *halves, *switches):
         with pytest.raises(
             InputError, match=f"^{name} {bad!r}: expected a (whole )?number from .* to [^\n]*$"
         ):
