@@ -9,31 +9,34 @@ from pathlib import Path
 from dmsrd_lite.domains import InputError, get_domain
 from dmsrd_lite.domains.domain import check_whole
 
+_PARTS = ("demonstrations", "stream", "test_set", "development_set")
+
 
 def _generate(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from dmsrd_lite.demonstrations import DATA_FOLDER, check_folder
-    from dmsrd_lite.demonstrators import reward_test_sets, streams
+    from dmsrd_lite.demonstrators import reward_test_sets as test_sets
+    from dmsrd_lite.demonstrators import streams
     from dmsrd_lite.workbook import presets
 
     domain, seed = get_domain(arguments.domain), check_whole(arguments.seed, "seed")
     folder = Path(arguments.output).resolve() if arguments.output else DATA_FOLDER
     check_folder(folder / "any")
-    generate = streams.generate_lifelong if arguments.lifelong else streams.generate_demonstrations
-    bar = partial(tqdm, desc="demonstrators")
-    print(json.dumps(generate(domain, presets.DEMONSTRATORS[domain.name], seed, folder, progress=bar)))
-    kinds = {
-        "test_set": (reward_test_sets.TEST_SEED, 10),
-        "development_set": (reward_test_sets.DEVELOPMENT_SEED, 1),
-    }
-    for kind, (offset, episodes) in (
-        {} if arguments.demonstrations_only or arguments.lifelong else kinds.items()
-    ):
-        path, settings = folder / f"{domain.name}_{kind}.npz", presets.TEST_SETS[domain.name]
-        bar, seed_of = partial(tqdm, desc=kind), seed + offset
-        make = partial(reward_test_sets.generate_test_set, n_episodes=episodes, progress=bar)
-        print(make(domain, settings, seed_of, path))
+    usual, parts = presets.DEMONSTRATORS[domain.name], arguments.part or _PARTS
+    if "demonstrations" in parts:
+        bar = partial(tqdm, desc="demonstrators", smoothing=0)
+        print(json.dumps(streams.generate_demonstrations(domain, usual, seed, folder, progress=bar)))
+    if "stream" in parts:
+        print(json.dumps(streams.generate_stream(domain, usual, seed, folder)))
+    kinds = {"test_set": (test_sets.TEST_SEED, 10), "development_set": (test_sets.DEVELOPMENT_SEED, 1)}
+    for kind, (offset, episodes) in kinds.items():
+        if kind in parts:
+            path, settings = folder / f"{domain.name}_{kind}.npz", presets.TEST_SETS[domain.name]
+            make = partial(
+                test_sets.generate_test_set, n_episodes=episodes, progress=partial(tqdm, desc=kind)
+            )
+            print(make(domain, settings, seed + offset, path))
     return 0
 
 
@@ -94,14 +97,13 @@ def _parser() -> argparse.ArgumentParser:
         return added
 
     generate = command(
-        "generate", _generate, "train demonstrators; write demonstrations, second take and test sets"
+        "generate", _generate, "train demonstrators; write them, what they show, a stream and test sets"
     )
     generate.add_argument("domain")
     generate.add_argument("--seed", default="0")
     generate.add_argument("--output", help="folder for the files (default: the repository's data)")
-    generate.add_argument("--demonstrations-only", action="store_true", help="no test and development sets")
     generate.add_argument(
-        "--lifelong", action="store_true", help="instead: 100 users, five of them and 95 mixtures"
+        "--part", action="append", choices=_PARTS, help="only this one (again for more; default: all)"
     )
     validate = command("validate", _validate, "say what is wrong with a demonstration or test file")
     validate.add_argument("files", nargs="+")

@@ -105,8 +105,8 @@ class RewardTestSet:
     """Trajectories from failure to success with their true returns, to evaluate a reward.
 
     observations (n, T/stride, obs_dim), every ``stride``-th new state; returns (n,) of the whole trajectory;
-    policy (n,), snapshot (n,): who made it and when in training; returns_every_step (n,), never stopped; None
-    where the file lacks it.
+    policy (n,), snapshot (n,): who made it and when in training; returns_every_step (n,), never stopped, and
+    failed (n, T/stride), 1 where the failure has happened by then: None where the file lacks it.
     """
 
     domain: Domain
@@ -116,6 +116,7 @@ class RewardTestSet:
     snapshot: np.ndarray
     metadata: dict
     returns_every_step: np.ndarray | None = None
+    failed: np.ndarray | None = None
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -229,6 +230,7 @@ def _check_test_set(arrays: dict, metadata: dict, domain: Domain) -> list[str]:
         "policy": (n,),
         "snapshot": (n,),
         "returns_every_step": (n,),
+        "failed": (n, "steps"),
     }
     return [
         f for name, shape in shapes.items() if name in arrays for f in _check_array(arrays[name], name, shape)
@@ -280,7 +282,8 @@ def load_test_set(path: str | Path, domain: Domain | None = None) -> RewardTestS
     arrays, metadata, domain = _load_checked(path, "test set", domain)
     every_step = arrays["returns_every_step"].astype(np.float64) if "returns_every_step" in arrays else None
     states, returns = arrays["observations"].astype(np.float32), arrays["returns"].astype(np.float64)
-    return RewardTestSet(domain, states, returns, arrays["policy"], arrays["snapshot"], metadata, every_step)
+    who, failed = (arrays["policy"], arrays["snapshot"]), arrays.get("failed")
+    return RewardTestSet(domain, states, returns, *who, metadata, every_step, failed)
 
 
 def load_shipped(domain: Domain, kind: str = "demonstrations") -> DemonstrationSet:

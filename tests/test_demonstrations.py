@@ -11,11 +11,13 @@ import pytest
 from dmsrd_lite import demonstrations
 from dmsrd_lite.__main__ import main
 from dmsrd_lite.demonstrations import load_demonstrations, load_shipped, load_shipped_test_set, load_test_set
+from dmsrd_lite.demonstrators import people
 from dmsrd_lite.domains import INVERTED_PENDULUM, LUNAR_LANDER, InputError
 from dmsrd_lite.learning.networks import GaussianPolicies
 from dmsrd_lite.learning.rollouts import rollout
+from dmsrd_lite.method import divergence, policy_mixture
 from dmsrd_lite.method.airl import AIRL, AIRLSettings
-from dmsrd_lite.method.divergence import demonstration_divergence, divergence_floor, divergence_table
+from dmsrd_lite.method.divergence import divergence_floor, divergence_table
 
 
 def about(**entries):
@@ -249,24 +251,49 @@ def test_shipped_sets(domain):
     assert len({s.metadata["seed"] for s in (shown, test, development)}) == 3, "trainings share nothing"
     assert np.isin(development.returns, test.returns).mean() < 0.05, "stray coincidences of rounded returns"
     assert len(np.unique(test.snapshot)) == 100
-    assert shown.metadata["choice"]["smallest_divergence"] >= domain.comparison.others_at_least
+    for some in (test, development):  # from the time of failure and of success
+        failing, good = (some.failed[:, -1] == 1).mean(), (some.returns >= domain.success_return).mean()
+        assert (0.2 < failing < 0.75, 0.2 < good < 0.65) == (True, True)
     worst, best = {"inverted_pendulum": (-1400, -20), "lunar_lander": (-500, 250)}[domain.name]
     assert test.returns.min() < worst < best < test.returns.max()
 
 
-def test_shipped_people_are_told_apart():
-    shown = load_shipped(INVERTED_PENDULUM)
-    table, comparison = divergence_table(shown.domain, shown.observations), shown.domain.comparison
-    smallest = table[~np.eye(10, dtype=bool)].min()
-    assert shown.metadata["choice"]["smallest_divergence"] == pytest.approx(smallest, abs=1e-3)
-    assert np.diag(table).max() <= comparison.own_at_most < comparison.others_at_least <= smallest
-    pilots, again = load_shipped(LUNAR_LANDER), load_shipped(LUNAR_LANDER, "second_take")
-    far, flights = demonstration_divergence, pilots.observations
-    others = [[far(LUNAR_LANDER, a, b) for b in flights] for a in flights]
-    np.fill_diagonal(others := np.array(others), np.inf)
-    assert (others.min(1) > divergence_floor(pilots, again) + 1).all(), (
-        "from other starts everybody is far away"
-    )
+@pytest.mark.parametrize("domain", [INVERTED_PENDULUM, LUNAR_LANDER], ids=lambda d: d.name)
+def test_shipped_people_differ_in_kind_and_are_told_apart(domain):
+    shown, again = load_shipped(domain), load_shipped(domain, "second_take")
+    choice, people = shown.metadata["choice"], [domain.diversity.describe(one) for one in shown.observations]
+    kinds = [person["kind"] for person in people]
+    assert choice["kind"] == kinds, "computed from what they show"
+    assert len(set(kinds[:5])) >= 3, "the base users of the stream"
+    floor = divergence_floor(shown, again)
+    assert choice["own_divergence"] == pytest.approx(floor, abs=2e-3)
+    assert min(choice["nearest_other"]) >= domain.comparison.others_at_least
+    if domain is INVERTED_PENDULUM:
+        above = divergence_table(domain, shown.observations) - floor[:, None]
+        np.fill_diagonal(above, np.inf)
+        assert choice["nearest_other"] == pytest.approx(above.min(1), abs=2e-3)
+        assert kinds.count("rocker") >= 3
+        assert kinds.count("swinger") >= 1
+        assert kinds.count("holder") <= 5
+
+
+@pytest.mark.parametrize("domain", [INVERTED_PENDULUM, LUNAR_LANDER], ids=lambda d: d.name)
+def test_shipped_demonstrators_are_those_who_showed(domain):
+    """Their policies give the likelihood in the file, and fresh takes from the same starts are as near."""
+    shown, domain = load_shipped(domain), domain.on_threads(1)
+    actor = people.load_shipped_demonstrators(domain, 10)
+    again = people.fresh_takes(actor.select([0, 1]), domain, 3, 5, shown.reset_seeds[:2])
+    assert np.allclose(again.observations[:, :, 0], shown.observations[:2, :, 0])
+    n, k, t = shown.actions.shape[:3]
+    states, actions = shown.observations[:, :, :t].reshape(n, k * t, -1), shown.actions.reshape(n, k * t, -1)
+    own = actor.log_density(states, actions).reshape(n, k, t).sum(-1)
+    assert own == pytest.approx(shown.log_likelihoods, rel=1e-3, abs=1.0)
+    stream = load_shipped(domain, "lifelong")
+    users = people.stream_actor(stream)
+    pick = [0, 7, 99]
+    flown = policy_mixture.Mixtures(users.actor, users.weights[pick])
+    kl = divergence.policy_divergences(flown, stream.select(pick), 0, n_rollouts=6)
+    assert np.abs(kl - np.array(stream.metadata["floor"])[pick]).mean() < 3.0
 
 
 def test_returns_of_the_shipped_test_sets():

@@ -1,65 +1,25 @@
-"""Who demonstrates: of the trained policies those that can do the task and differ."""
+"""Who demonstrates: of the trained policies those that can do the task and differ, in kind first of all."""
 
+import json
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from dmsrd_lite.demonstrations import DemonstrationSet, demonstrations_from
+from dmsrd_lite.demonstrations import DemonstrationSet, demonstrations_from, plain
 from dmsrd_lite.demonstrators.diayn import DiaynSettings, diversity_of
 from dmsrd_lite.domains import Domain, InputError
+from dmsrd_lite.domains.domain import Seed
 from dmsrd_lite.learning.networks import Actor, Policies
 from dmsrd_lite.learning.rollouts import draw_reset_seeds, rollout
 from dmsrd_lite.method.airl import clone_demonstrations
-from dmsrd_lite.method.divergence import divergence_table, own_divergence, policy_divergences
-from dmsrd_lite.method.policy_mixture import Mixtures, regress_weights
+from dmsrd_lite.method.divergence import divergence_floor, divergence_table, policy_divergences
+from dmsrd_lite.method.policy_mixture import Mixtures, MixtureSettings, likeliest_weights, search_mixture
 
-OUTSIDE = (
-    1.0  # nats from any mixture of the others, for users who found strategies: twice what lesson 06 allows
-)
-
-
-def most_distinct(distance: np.ndarray, n_kept: int) -> list[int]:
-    """Greedy choice of ``n_kept`` strategies: again and again drop one of the closest pair, the one nearer to
-    the rest.
-
-    distance (m, m): the diagonal is not read, a pair's distance is the smaller of its two directions.
-    """
-    distance = np.minimum(distance, distance.T).astype(float)
-    np.fill_diagonal(distance, np.inf)
-    left = list(range(len(distance)))
-    while len(left) > n_kept:
-        sub = distance[np.ix_(left, left)]
-        pair = np.unravel_index(sub.argmin(), sub.shape)
-        left.pop(min(pair, key=lambda i: tuple(np.sort(sub[i]))))
-    return left
-
-
-def visible_distance(domain: Domain, observations: np.ndarray) -> np.ndarray:
-    """How different strategies look: the largest difference of their mean diversity features, in the finest
-    units.
-
-    observations (m, k, T+1, obs_dim) -> (m, m).
-    """
-    diversity = diversity_of(domain)
-    units = np.min([population.feature_units for population in diversity.populations], axis=0)
-    means = (diversity.features(observations) / units).mean((1, 2))
-    return np.abs(means[:, None] - means[None]).max(-1)
-
-
-def distances(shown: DemonstrationSet, actor: Policies, seed: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """How far strategies are apart, (m, m) nats, and each one's distance from itself, (m,).
-
-    Demonstrations against each other; in a domain with ``matched_starts`` against rollouts of every policy
-    from the demonstration's starts, less what its own policy reaches from there.
-    """
-    n, k = shown.observations.shape[:2]
-    if not shown.domain.comparison.matched_starts:
-        table = divergence_table(shown.domain, shown.observations)
-        return table, np.diag(table)
-    table = np.array(
-        [policy_divergences(actor, shown.select([i]), [*seed, i], n_rollouts=k) for i in range(n)]
-    )
-    return table - np.diag(table)[:, None], np.diag(table)
+OUTSIDE = 1.0  # nats above the own second take: who is nearer to mixtures of the others is one of them
+DRAWS, FINALISTS = 5000, 4  # of sets of people
+TRIALS = 20  # from fresh starts, in which nobody may fail
 
 
 def good_flights(
@@ -80,92 +40,133 @@ def good_flights(
     return good, [demonstrations_from(data.select_episodes(first), actor) for data in tried]
 
 
-def choose_demonstrators(
-    domain: Domain,
-    actor: Actor,
-    settings: DiaynSettings,
-    seed: int,
+def distances(
+    takes: list[DemonstrationSet], actor: Policies, seed: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far demonstration i is from person j, (m, m) nats above its own second take, and that, (m,).
+
+    Against the other's demonstration; in a domain with ``matched_starts`` against rollouts of every policy
+    from the demonstration's own starts.
+    """
+    shown, second = takes
+    floor = divergence_floor(shown, second)
+    if not shown.domain.comparison.matched_starts:
+        return divergence_table(shown.domain, shown.observations) - floor[:, None], floor
+    n, k = shown.observations.shape[:2]
+    rows = [policy_divergences(actor, shown.select([i]), [*seed, i], n_rollouts=k) for i in range(n)]
+    return np.array(rows) - floor[:, None], floor
+
+
+def draw_in_turn(
+    kinds: list[str], distance: np.ndarray, least: float, n_kept: int, rng: np.random.Generator
+) -> list[int]:
+    """People in a random order in which each is of the kind that is rarest so far, and nobody is too near.
+
+    distance (m, m), nats: nobody is nearer than ``least`` to the others, in either direction.
+    """
+    apart, kept = np.minimum(distance, distance.T), list[int]()
+    while len(kept) < n_kept:
+        count = Counter(kinds[i] for i in kept)
+        near = apart[:, kept].min(1, initial=np.inf)
+        free = [i for i in range(len(kinds)) if i not in kept and near[i] >= least]
+        if not free:
+            break
+        rarest = min(count[kinds[i]] for i in free)
+        kept.append(int(rng.choice([i for i in free if count[kinds[i]] == rarest])))
+    return kept
+
+
+def choose_different(
+    kinds: list[str],
+    distance: np.ndarray,
+    least: float,
     n_kept: int,
-    n_trajectories: int = 3,
-    *,
-    spanning: bool = False,
+    outside: Callable[[list[int]], np.ndarray],
+    seed: Seed,
+) -> list[int]:
+    """Of many draws (``draw_in_turn``) the one in which most people are no mixture of the others.
+
+    Asked of the ``FINALISTS`` that are the most even in kinds, and then the farthest apart; ``outside(kept)``
+    (len(kept),): nats from mixtures of the others. Fewer than ``n_kept`` where no draw finds so many.
+    """
+    rng = np.random.default_rng(seed)
+    drawn = [draw_in_turn(kinds, distance, least, n_kept, rng) for _ in range(DRAWS)]
+    apart = np.where(np.eye(len(kinds), dtype=bool), np.inf, np.minimum(distance, distance.T))
+
+    def rank(kept: list[int]) -> tuple:
+        counts = sorted(Counter(kinds[i] for i in kept).values(), reverse=True)
+        return -len(kept), counts, -apart[np.ix_(kept, kept)].min(initial=np.inf)
+
+    finalists = sorted({frozenset(kept): kept for kept in drawn}.values(), key=rank)[:FINALISTS]
+    whole = [kept for kept in finalists if len(kept) == n_kept]
+    return max(whole, key=lambda kept: (outside(kept) >= OUTSIDE).sum()) if whole else finalists[0]
+
+
+def choose_demonstrators(
+    domain: Domain, actor: Actor, settings: DiaynSettings, seed: int, n_kept: int, n_trajectories: int = 3
 ) -> tuple[np.ndarray, list[DemonstrationSet], dict]:
-    """The most distinct of the successful policies: their indices, two takes of them, and the choice for the
+    """The most different of the successful policies: their indices, two takes of them, and the choice for the
     metadata.
 
-    Success: ``n_trajectories`` good starts (``good_flights``), and (without ``matched_starts`` or
-    ``spanning``) own trajectories within ``comparison.own_at_most`` of each other. Of the successful ones
-    those are kept that look most different (with ``matched_starts``: are most nats apart),
-    ``comparison.others_at_least`` nats apart (``distances``); or, with ``spanning``, those that are
-    ``OUTSIDE`` nats from mixtures of each other (``farthest_from_mixtures``). ``InputError`` when too few are
-    left.
+    Success: ``n_trajectories`` good starts (``good_flights``), no failure in ``TRIALS`` (without
+    ``matched_starts``), and a clone that fails no more often than 1 time in 20. Then ``choose_different``.
+    ``InputError`` when too few are left.
     """
-    comparison = domain.comparison
-    good, shown = good_flights(domain, actor, settings, n_trajectories, seed)
+    comparison, describe = domain.comparison, diversity_of(domain).describe
+    good, takes = good_flights(domain, actor, settings, n_trajectories, seed)
     fits = good.sum(1) >= n_trajectories
-    if not (comparison.matched_starts or spanning):
-        fits &= np.array([own_divergence(domain, o) <= comparison.own_at_most for o in shown[0].observations])
-    kept, smallest, own = np.flatnonzero(fits), 0.0, np.zeros(1)
-    least = OUTSIDE if spanning else comparison.others_at_least
-    pick: list[int] = []
-    if len(kept) >= n_kept and spanning:
-        pick, far, own = farthest_from_mixtures(actor.select(kept), shown[0].select(kept), n_kept, [seed, 10])
-        kept, smallest = kept[pick], far.min() if len(pick) == n_kept else 0.0
-    elif len(kept) >= n_kept:
-        table, own = distances(shown[0].select(kept), actor.select(kept), [seed, 10])
-        nearness = table / comparison.others_at_least - 1  # below 0: too near, and dropped first
-        look = table if comparison.matched_starts else visible_distance(domain, shown[0].observations[kept])
-        pick = most_distinct(np.where(np.minimum(nearness, nearness.T) < 0, nearness, look), n_kept)
-        smallest = table[np.ix_(pick, pick)][~np.eye(n_kept, dtype=bool)].min()
-        kept = kept[pick]
-    if smallest < least or len(pick) < n_kept:
+    fails = rollout(domain, actor, TRIALS, [seed, 9]).failed.any(-1).mean(1)
+    clones = clone_demonstrations(takes[0], [seed, 11], n_steps=2000)[0].actor()
+    clones_fail = rollout(domain, clones, TRIALS, [seed, 12]).failed.any(-1).mean(1)
+    fits &= clones_fail - fails <= 0.05
+    if not comparison.matched_starts:
+        fits &= fails == 0
+    able = np.flatnonzero(fits)
+    takes, clones = [take.select(able) for take in takes], clones.select(able)
+    people = [describe(shown) for shown in takes[0].observations]
+    table, floor = (
+        distances(takes, actor.select(able), [seed, 10]) if len(able) else (np.zeros((0, 0)), np.zeros(0))
+    )
+
+    def without(kept: list[int], row: int) -> tuple[list[int], Actor, DemonstrationSet]:
+        others = [j for j in range(len(kept)) if j != row]
+        return others, clones.select([kept[j] for j in others]), takes[0].select([kept[row]])
+
+    def outside(kept: list[int]) -> np.ndarray:
+        weights = np.zeros((len(kept), len(kept)))
+        for row in range(len(kept)):
+            others, known, one = without(kept, row)
+            weights[row, others] = likeliest_weights(known, one)
+        mixtures, shown = Mixtures(clones.select(kept), weights), takes[0].select(kept)
+        return policy_divergences(mixtures, shown, [seed, 13]) - floor[kept]
+
+    kinds = [str(person["kind"]) for person in people]
+    kept = choose_different(kinds, table, comparison.others_at_least, n_kept, outside, [seed, 15])
+    if len(kept) < n_kept:
+        found = ", ".join(f"{n} {kind}" for kind, n in Counter(kinds).items())
         raise InputError(
-            f"only {fits.sum()} of {len(fits)} demonstrators of {domain.name} with seed {seed} succeeded, "
-            f"the nearest two kept {smallest:.1f} nats apart; expected {n_kept} at least {least} apart"
+            f"only {len(kept)} of {len(fits)} demonstrators of {domain.name} with seed {seed} succeed "
+            f"({found}) and are {comparison.others_at_least} nats apart; expected {n_kept}"
         )
+    chosen = table[np.ix_(kept, kept)] + np.where(np.eye(n_kept, dtype=bool), np.inf, 0.0)
+    best = outside(kept)
+    for row in range(n_kept):  # what its actions point at need not be the nearest
+        _, known, one = without(kept, row)
+        found = (
+            search_mixture(known, one, MixtureSettings(24, 16), [seed, 14, row]).divergence - floor[kept[row]]
+        )
+        best[row] = min(best[row], found)
     choice = {
         "trained": len(fits),
-        "good_starts": good.mean(1),
-        "successful": np.flatnonzero(fits),
-        "kept": kept,
-        "smallest_divergence": smallest,
-        "largest_own": own[pick].max(),
+        "successful": able,
+        "kept": able[kept],
+        "kind": [kinds[i] for i in kept],
+        "people": [people[i] for i in kept],
+        "own_divergence": floor[kept],
+        "nearest_other": chosen.min(1),
+        "above_mixtures_of_others": best,
+        "good_starts": good[able[kept]].mean(1),
     }
-    takes = [replace(everybody.select(kept), strategy_labels=np.arange(n_kept)) for everybody in shown]
-    return kept, takes, {name: np.round(value, 3).tolist() for name, value in choice.items()}
-
-
-def farthest_from_mixtures(
-    actor: Actor, shown: DemonstrationSet, n_kept: int, seed: list[int]
-) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Demonstrators none of whom is a mixture of the others, judged as a learner would, by their clones:
-    farthest first.
-
-    Distance: KL of the demonstration under the mixture of the kept clones that its actions point at
-    (``regress_weights``), less the KL under its own clone. Who comes within ``OUTSIDE`` of mixtures of those
-    kept later is dropped again. Left out are those who cannot be imitated: whose clone is half of ``OUTSIDE``
-    farther, or fails 1 time in 20 more often. Returns the indices, each one's distance from mixtures of the
-    other kept ones, and the demonstrators' own KLs, all.
-    """
-    domain, everyone = shown.domain, np.arange(shown.n_demonstrations)
-    cloned, _ = clone_demonstrations(shown, seed, n_steps=2000, streams=(3, 4))
-    clones = cloned.actor()
-    own, reached = (policy_divergences(some, shown, [*seed, 0]) for some in (actor, clones))
-    fails, clones_fail = (
-        rollout(domain, some, 20, [*seed, 5]).failed.any(-1).mean(1) for some in (actor, clones)
-    )
-    left = list(everyone[(reached - own <= OUTSIDE / 2) & (clones_fail - fails <= 0.05)])
-
-    def distance(kept: list[int], who: list[int]) -> np.ndarray:
-        known = clones.select(kept)
-        weights = [regress_weights(known, shown.select([i])) for i in who]
-        return policy_divergences(Mixtures(known, weights), shown.select(who), [*seed, 1]) - reached[who]
-
-    kept: list[int] = []
-    while left and len(kept) < n_kept:
-        far = distance(kept or [left[0]], left)
-        kept.append(left.pop(int(far.argmax())))
-        for i in kept[:-1]:
-            if len(kept) > 2 and distance([j for j in kept if j != i], [i])[0] < OUTSIDE:
-                kept.remove(i)
-    return kept, np.array([distance([j for j in kept if j != i], [i])[0] for i in kept]), own
+    shown = [replace(take.select(kept), strategy_labels=np.arange(n_kept)) for take in takes]
+    rounded = json.loads(json.dumps(plain(choice)), parse_float=lambda number: round(float(number), 3))
+    return able[kept], shown, rounded

@@ -3,7 +3,7 @@
 Eysenbach, Gupta, Ibarz and Levine (2019).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ import torch
 
 from dmsrd_lite.domains import Domain, InputError
 from dmsrd_lite.domains.domain import Diversity, Population, Seed
-from dmsrd_lite.learning.networks import Actor, BatchedMLP, one_thread, to_tensor
+from dmsrd_lite.learning.networks import BatchedMLP, one_thread, to_tensor
 from dmsrd_lite.learning.policy_optimization import TrainingSettings, train_policies
 from dmsrd_lite.learning.rollouts import Rollouts
 
@@ -100,17 +100,3 @@ def train_demonstrators(
     training = replace(settings.training, last_sigma=population.last_sigma)
     for record in train_policies(domain, reward, training, seed):
         yield {**record, "accuracy": reward.accuracy}
-
-
-def train_all_demonstrators(
-    domain: Domain, settings: DiaynSettings, seed: int, progress: Callable = iter
-) -> Actor:
-    """The policies of all of the domain's populations, as they act when they demonstrate."""
-    actors = []
-    for number, population in enumerate(diversity_of(domain).populations):
-        *_, last = progress(
-            train_demonstrators(domain, population, settings, seed + number * POPULATION_SEED)
-        )
-        actors.append(last["policies"].actor())
-    actor = Actor.joined(actors)
-    return actor.select(np.arange(actor.n_strategies), settings.acting_noise)

@@ -1,21 +1,52 @@
-"""Demonstrations as files: ten people, and a stream of five people and mixtures of them."""
+"""Demonstrations as files: ten people, and a stream of five of them and mixtures of these."""
 
 import functools
+import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
-from dmsrd_lite.demonstrations import DemonstrationSet, check_folder, save_demonstrations
+from dmsrd_lite.demonstrations import (
+    DemonstrationSet,
+    check_folder,
+    load_demonstrations,
+    plain,
+    save_demonstrations,
+)
 from dmsrd_lite.demonstrators.choice import choose_demonstrators, good_flights
-from dmsrd_lite.demonstrators.diayn import DiaynSettings, train_all_demonstrators
+from dmsrd_lite.demonstrators.diayn import POPULATION_SEED, DiaynSettings, diversity_of, train_demonstrators
+from dmsrd_lite.demonstrators.people import load_demonstrators, save_demonstrators
 from dmsrd_lite.domains import Domain, InputError
 from dmsrd_lite.learning.networks import Actor
 from dmsrd_lite.method.divergence import divergence_floor
 from dmsrd_lite.method.policy_mixture import Mixtures
 
 LIFELONG_SEED = 5000  # added to a generation's seed for the mixtures
+
+
+def train_all_demonstrators(
+    domain: Domain, settings: DiaynSettings, seed: int, folder: Path | None = None, progress: Callable = iter
+) -> Actor:
+    """The policies of all of the domain's populations, as they act when they demonstrate.
+
+    A population that ``folder`` holds, trained with this seed and these settings, is not trained again.
+    """
+    actors = []
+    for number, population in enumerate(diversity_of(domain).populations):
+        made_with = json.dumps(plain({"seed": seed, "population": asdict(population), **asdict(settings)}))
+        path = None if folder is None else folder / f"{domain.name}_population_{number}.safetensors"
+        known = load_demonstrators(path, domain) if path is not None and path.exists() else None
+        if known is None or known[1] != made_with:
+            own_seed = seed + number * POPULATION_SEED
+            *_, last = progress(train_demonstrators(domain, population, settings, own_seed))
+            known = last["policies"].actor(), made_with
+            if path is not None:
+                save_demonstrators(path, *known)
+        actors.append(known[0])
+    actor = Actor.joined(actors)
+    return actor.select(np.arange(actor.n_strategies), settings.acting_noise)
 
 
 def generate_demonstrations(
@@ -28,22 +59,19 @@ def generate_demonstrations(
     n_trajectories: int = 3,
     progress: Callable = iter,
 ) -> dict:
-    """Train demonstrators, choose among them (``choose_demonstrators``), write their demonstrations and a
-    second take.
+    """Train demonstrators, choose among them (``choose_demonstrators``), write them, their demonstrations and
+    a second take.
 
     Returns the choice as written into the files' metadata; ``InputError`` if too few are left (nothing is
-    written then).
+    written then but the trained populations, which another call does not train again).
     """
     takes = ("demonstrations", "second_take")
     paths = {take: check_folder(folder / f"{domain.name}_{take}.npz") for take in takes}
-    actor = train_all_demonstrators(domain, settings, seed, progress)
-    _, shown, choice = choose_demonstrators(domain, actor, settings, seed, n_kept, n_trajectories)
-    metadata = {
-        "seed": seed,
-        "choice": choice,
-        "settings": asdict(settings),
-        "made_by": f"python -m dmsrd_lite generate {domain.name} --seed {seed}",
-    }
+    actor = train_all_demonstrators(domain, settings, seed, folder / ".populations", progress)
+    kept, shown, choice = choose_demonstrators(domain, actor, settings, seed, n_kept, n_trajectories)
+    made_by = f"python -m dmsrd_lite generate {domain.name} --seed {seed}"
+    metadata = {"seed": seed, "choice": choice, "settings": asdict(settings), "made_by": made_by}
+    save_demonstrators(folder / f"{domain.name}_demonstrators.safetensors", actor.select(kept), made_by)
     for (take, path), some in zip(paths.items(), shown, strict=True):
         save_demonstrations(path, replace(some, metadata={**metadata, "take": take}))
     return choice
@@ -82,29 +110,29 @@ def draw_mixtures(
     return weights, takes, n_redrawn
 
 
-def generate_lifelong(
-    domain: Domain,
-    settings: DiaynSettings,
-    seed: int,
-    folder: Path,
-    *,
-    n_base: int = 5,
-    n_mixtures: int = 95,
-    progress: Callable = iter,
+def generate_stream(
+    domain: Domain, settings: DiaynSettings, seed: int, folder: Path, *, n_base: int = 5, n_mixtures: int = 95
 ) -> dict:
-    """Train demonstrators, choose ``n_base`` of them, write their demonstrations and those of mixtures of
-    them: a stream.
+    """Write a stream: the first ``n_base`` of the people whose files ``folder`` holds, and mixtures of them.
 
-    Beside the choice, the file's metadata holds what is for evaluation only: the true ``weights`` (n,
-    n_base), the demonstrators' ``floor`` (n,) in nats (from a second take) and ``returns`` (n,).
+    The choice puts different kinds first, so the base users are of as many kinds as there are.
+
+    Its metadata holds what is for evaluation only: the true ``weights`` (n, n_base), the ``floor`` (n,) in
+    nats (from a second take), the ``returns`` (n,) and the base users' ``kind``. Returns how many were
+    redrawn.
     """
     path = check_folder(folder / f"{domain.name}_lifelong.npz")
-    actor = train_all_demonstrators(domain, settings, seed, progress)
-    kept, takes, choice = choose_demonstrators(domain, actor, settings, seed, n_base, spanning=True)
+    takes = [
+        load_demonstrations(folder / f"{domain.name}_{take}.npz", domain)
+        for take in ("demonstrations", "second_take")
+    ]
+    people, _ = load_demonstrators(folder / f"{domain.name}_demonstrators.safetensors", domain, n_base)
+    base = range(n_base)
+    kinds, takes = takes[0].metadata["choice"]["kind"][:n_base], [take.select(base) for take in takes]
     assert takes[0].returns is not None
     returns = takes[0].returns.mean(1)
     least = returns.min() - np.ptp(returns)  # clearly below the worst: by more than the best is above it
-    drawn = draw_mixtures(domain, actor.select(kept), settings, seed + LIFELONG_SEED, n_mixtures, least)
+    drawn = draw_mixtures(domain, people.select(base), settings, seed + LIFELONG_SEED, n_mixtures, least)
     weights, mixed, n_redrawn = drawn
     shown, again = (base.joined(more) for base, more in zip(takes, mixed, strict=True))
     assert shown.returns is not None
@@ -113,25 +141,10 @@ def generate_lifelong(
         "floor": divergence_floor(shown, again),
         "returns": shown.returns.mean(1),
     }
-    metadata = {
-        "seed": seed,
-        "choice": {**choice, "redrawn": n_redrawn},
-        "settings": asdict(settings),
-        "made_by": f"python -m dmsrd_lite generate {domain.name} --lifelong --seed {seed}",
-    }
+    made_by = f"python -m dmsrd_lite generate {domain.name} --seed {seed}"
+    metadata = {"seed": seed, "kind": kinds, "redrawn": n_redrawn, "made_by": made_by}
     metadata |= {name: np.round(value, 4).tolist() for name, value in labels.items()}
-    small = {
-        name: array.astype(np.float32) for name, array in shown.arrays().items()
-    }  # half the size of the file
-    save_demonstrations(
-        path,
-        replace(
-            shown,
-            observations=small["observations"],
-            actions=small["actions"],
-            rewards=None,
-            strategy_labels=None,
-            metadata=metadata,
-        ),
-    )
-    return {**choice, "redrawn": n_redrawn}
+    small = {name: array.astype(np.float32) for name, array in shown.arrays().items()}  # half the file's size
+    shown = replace(shown, observations=small["observations"], actions=small["actions"], metadata=metadata)
+    save_demonstrations(path, replace(shown, rewards=None, strategy_labels=None))
+    return {"kind": kinds, "redrawn": n_redrawn}

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -65,7 +65,7 @@ class Drawing:
 class Population:
     """How a group of demonstrators is trained to differ."""
 
-    feature_units: tuple[float, ...]  # the smallest difference that counts, for each feature of ``Diversity``
+    feature_units: tuple[float, ...]  # smallest difference that counts, for each feature; inf: is not seen
     last_sigma: float = 0.0  # action noise at the end of training, action units; 0: left to the optimiser
 
 
@@ -76,8 +76,12 @@ class Diversity:
     features: Callable[
         [np.ndarray], np.ndarray
     ]  # (..., T+1, obs_dim) -> (..., T, n): what a spectator would see
+    feature_names: tuple[str, ...]
     populations: tuple[Population, ...]  # demonstrators are chosen from all of these ...
     test_population: Population  # ... and the test sets for rewards are made by this one
+    describe: Callable[
+        [np.ndarray], dict[str, Any]
+    ]  # one person's (k, T+1, obs_dim) -> numbers and a ``kind``
 
 
 @dataclass(frozen=True)

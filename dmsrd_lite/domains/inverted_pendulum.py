@@ -4,7 +4,10 @@ import os
 
 import numpy as np
 
-from dmsrd_lite.domains.domain import Diversity, Domain, Drawing, Population, Simulator
+from dmsrd_lite.domains.domain import Diversity, Domain, Drawing, Population, Simulator, StateComparison
+
+OMEGA = 1.2  # rad/s: a swing of five seconds
+CAP = 1.2  # m/s
 
 
 class PendulumBatch:
@@ -66,12 +69,40 @@ def draw(observation: np.ndarray, height: int = 120, width: int = 240) -> np.nda
     return np.asarray(image.resize((width, height), Image.Resampling.LANCZOS))
 
 
-def features(observations: np.ndarray, window: int = 75) -> np.ndarray:
-    """Where the cart is, and how wide it moved in the last 3 s (m each): (..., T+1, 4) -> (..., T, 2)."""
-    x = observations[..., 0]
-    padded = np.concatenate([np.repeat(x[..., :1], window - 1, axis=-1), x], axis=-1)
-    width = np.ptp(np.lib.stride_tricks.sliding_window_view(padded, window, axis=-1), axis=-1)
-    return np.stack([x[..., 1:], width[..., 1:]], axis=-1)
+def features(observations: np.ndarray) -> np.ndarray:
+    """Where the cart is (m), and how fast it swings, at most CAP (m/s): (..., T+1, 4) -> (..., T, 2).
+
+    The swing speed ``hypot(xdot, g theta / OMEGA)`` knows nothing of the place: 0 for whoever holds still
+    anywhere, constant on a swing, because a balanced cart accelerates at about g theta. Without the bound,
+    who falls differs most.
+    """
+    x, theta, speed = (observations[..., 1:, i] for i in range(3))
+    return np.stack([x, np.minimum(np.hypot(speed, 9.81 * theta / OMEGA), CAP)], axis=-1)
+
+
+def describe(observations: np.ndarray) -> dict[str, float | str]:
+    """What one sees of a person, from x after the first 8 s: (k, T+1, 4) -> numbers and a kind.
+
+    ``share``: of the power of x at periods of 0.5 to 6 s. With at least 0.6 of it, and by more than a tremor
+    (a standard deviation of 0.03 m), somebody moves: a swinger from 0.15 m on, else a rocker. Who does not
+    move is a holder (below 0.1 m) or a drifter.
+    """
+    x = observations[:, min(200, observations.shape[1] // 2) :, 0]
+    power = (np.abs(np.fft.rfft(x - x.mean(1, keepdims=True), axis=1)) ** 2).mean(0)[1:]
+    frequency = np.fft.rfftfreq(x.shape[1], 0.04)[1:]
+    share = power[(frequency >= 1 / 6) & (frequency <= 2)].sum() / max(power.sum(), 1e-12)
+    deviation = x.std(1).mean()
+    still, moving = (
+        ("holder" if deviation < 0.1 else "drifter"),
+        ("swinger" if deviation >= 0.15 else "rocker"),
+    )
+    return {
+        "kind": moving if share >= 0.6 and deviation >= 0.03 else still,
+        "mean x (m)": float(x.mean()),
+        "deviation of x (m)": float(deviation),
+        "period (s)": float(1 / frequency[power.argmax()]),
+        "share of power at 0.5 to 6 s": float(share),
+    }
 
 
 INVERTED_PENDULUM = Domain(
@@ -89,12 +120,26 @@ INVERTED_PENDULUM = Domain(
     reward_text="-|theta| of the new state, in rad, every step",
     failure_text="falls",
     failed=lambda states, rewards: np.abs(states[..., 1]) > 1.0,
-    success_return=-60.0,
+    success_return=-100.0,
     simulator=Simulator(PendulumBatch),
+    comparison=StateComparison(others_at_least=2.5),
     drawing=Drawing(draw, phase_axes=(0, 2), reward_axes=(1, 0), reward_window=((-1.6, 1.6), (-1.0, 1.0))),
     diversity=Diversity(
-        features,  # one population is told apart by place, one by movement
-        populations=(Population((0.1, 0.05), last_sigma=0.15), Population((0.4, 0.02), last_sigma=0.3)),
-        test_population=Population((0.25, 0.03)),
+        features,  # populations that are told apart by place, by swing speed, and by both
+        ("place (m)", "swing speed (m/s)"),
+        populations=(
+            Population((0.1, np.inf), last_sigma=0.15),
+            Population((np.inf, 0.12), last_sigma=0.3),  # who swings widely must be used to much noise
+            Population((np.inf, 0.12), last_sigma=0.3),
+            Population((np.inf, 0.08), last_sigma=0.15),
+            Population((np.inf, 0.08), last_sigma=0.2),
+            Population((0.4, 0.08), last_sigma=0.15),
+            Population((0.3, 0.12), last_sigma=0.3),
+            Population((0.4, 0.08), last_sigma=0.2),
+            Population((0.2, 0.1), last_sigma=0.25),
+            Population((0.3, 0.12), last_sigma=0.25),
+        ),
+        test_population=Population((0.4, 0.08)),
+        describe=describe,
     ),
 )

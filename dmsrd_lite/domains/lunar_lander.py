@@ -75,6 +75,30 @@ def features(observations: np.ndarray) -> np.ndarray:
     return np.concatenate([place, time[..., None]], axis=-1)
 
 
+def describe(observations: np.ndarray) -> dict[str, float | str]:
+    """What one sees of a pilot, in the mean over flights: (k, T+1, 8) -> numbers and a kind.
+
+    From which side the pad is approached (mean x over the upper part of the way, half widths), how long it
+    takes to the first touch (s), and how far the lander leans (largest angle in flight, rad).
+    """
+    touches = observations[..., 6:8].max(-1) > 0  # (k, T+1)
+    steps = np.where(touches.any(1), touches.argmax(1), touches.shape[1] - 1)
+    flights = [one[: step + 1] for one, step in zip(observations, steps, strict=True)]
+    side = float(
+        np.mean([one[one[:, 1] > 0.4][:, 0].mean() if (one[:, 1] > 0.4).any() else 0.0 for one in flights])
+    )
+    seconds = float(steps.mean() * 0.02)
+    lean = float(np.mean([np.abs(one[:, 4]).max() for one in flights]))
+    way = "from the left" if side < -0.05 else "from the right" if side > 0.05 else "from above"
+    pace = "quick" if seconds < 2.75 else "slow" if seconds > 3.75 else "steady"
+    return {
+        "kind": f"{pace}, {way}",
+        "side (half widths)": side,
+        "first touch (s)": seconds,
+        "largest angle (rad)": lean,
+    }
+
+
 _UNITS = (0.1, 0.2, 0.1)
 LUNAR_LANDER = Domain(
     name="lunar_lander",
@@ -102,5 +126,7 @@ LUNAR_LANDER = Domain(
     ),
     exploration=Exploration(((10.0, 0.0), (30.0, 0.0), (1.0, 2.0))),  # only failures: near misses hurt R_Task
     drawing=Drawing(draw, phase_axes=(0, 1), reward_axes=(0, 1), reward_window=((-1.0, 1.0), (-0.2, 1.5))),
-    diversity=Diversity(features, (Population(_UNITS, last_sigma=0.2),), Population(_UNITS)),
+    diversity=Diversity(
+        features, ("x", "y", "time"), (Population(_UNITS, last_sigma=0.2),), Population(_UNITS), describe
+    ),
 )  # fmt: skip

@@ -33,8 +33,8 @@ class MethodSettings:
     batch_steps: int = 40  # discriminator updates per iteration of AIRL Batch, one model for all the data
 
     def as_in_the_paper(self) -> "MethodSettings":
-        """No warm start, cloning term or coverage, and AIRL for a new strategy on its own reward alone."""
-        off: dict[str, Any] = {"warm_start": False, "cloning_weight": 0.0, "coverage": False}
+        """From nothing without coverage, and AIRL for a new strategy on its own reward alone."""
+        off: dict[str, Any] = {"start": "nothing", "coverage": "none"}
         airl, msrd = replace(self.dmsrd.airl, **off), replace(self.dmsrd.msrd, **off)
         loop = replace(self.dmsrd, airl=airl, msrd=msrd, add_task_reward=False)
         return replace(self, airl=replace(self.airl, **off), msrd=replace(self.msrd, **off), dmsrd=loop)
@@ -90,7 +90,7 @@ def train_method(
     elif method == "AIRL Single":
         learner = AIRL(shown, settings.airl, seed)
     else:
-        only_clone = replace(settings.airl, n_iterations=0, coverage=False, warm_start=True)
+        only_clone = replace(settings.airl, n_iterations=0, coverage="none", start="clone")
         clone = AIRL(shown, only_clone, seed).policies
         return Learned(clone, weights, seconds=time.perf_counter() - start)
     for _ in progress(learner.train()):

@@ -1,7 +1,10 @@
 """The metrics of every table: one function scores every method in the same way."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
+from scipy.stats import rankdata
 
 from dmsrd_lite.demonstrations import DemonstrationSet, RewardTestSet
 from dmsrd_lite.domains.domain import Seed, extend
@@ -59,6 +62,39 @@ def reward_correlation(trajectory_rewards: np.ndarray, returns: np.ndarray) -> f
     if np.ptp(trajectory_rewards) == 0:
         return float("nan")
     return float(np.corrcoef(trajectory_rewards, returns)[0, 1])
+
+
+@dataclass(frozen=True)
+class Correlations:
+    """How a reward's trajectory means go with true returns."""
+
+    pearson: float
+    spearman: float  # of ranks: a reward that only says who failed does not get far
+    spearman_of_good: float  # among those that never fail; NaN where the test set does not say
+
+    def __str__(self) -> str:
+        return f"{self.pearson:6.3f} {self.spearman:6.3f} {self.spearman_of_good:6.3f}"
+
+
+def reward_correlations(test_set: RewardTestSet, trajectory_rewards: np.ndarray) -> Correlations:
+    """The three correlations of any reward, given as mean rewards (n,) of the test set's trajectories."""
+
+    def ranked(some: np.ndarray) -> float:
+        return reward_correlation(rankdata(trajectory_rewards[some]), rankdata(test_set.returns[some]))
+
+    everybody = np.ones(len(test_set.returns), dtype=bool)
+    good = everybody & (False if test_set.failed is None else test_set.failed[:, -1] == 0)
+    among_good = ranked(good) if good.sum() > 1 else float("nan")
+    pearson = reward_correlation(trajectory_rewards, test_set.returns)
+    return Correlations(pearson, ranked(everybody), among_good)
+
+
+def one_line_rewards(test_set: RewardTestSet) -> dict[str, np.ndarray]:
+    """Mean rewards (n,) of what needs no learning: what any learned reward is to be compared with."""
+    states = test_set.observations
+    scaled = test_set.domain.network_input(states)
+    found = {"-|x|": -np.abs(states[..., 0]).mean(1), "-|s|^2": -(scaled**2).sum(-1).mean(1)}
+    return found if test_set.failed is None else {"has not failed": 1 - test_set.failed.mean(1), **found}
 
 
 def correlations_on(test_set: RewardTestSet, rewards: Rewards, part: str = "g") -> np.ndarray:

@@ -4,6 +4,7 @@
 is ``f - log pi(a|s)``. Paper: section "Preliminaries"; Fu, Luo, Levine (2018).
 """
 
+import copy
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -28,7 +29,13 @@ from dmsrd_lite.learning.networks import (
 from dmsrd_lite.learning.policy_optimization import PolicyOptimizer, PPOSettings
 from dmsrd_lite.learning.rollouts import Rollouts, rollout
 
-POLICY_REWARDS = ("g", "f_minus_log_pi")
+WORDS = {  # of the settings that are words
+    "start": ("clone", "nothing"),
+    "policy_base": ("g", "f"),
+    "coverage": ("half", "once", "none"),
+    "penalty_points": ("between", "samples", "demonstrations"),
+}
+REPLAY_SIZE = 100_000  # samples per strategy that a replay of all iterations holds at most
 Samples = tuple[
     torch.Tensor, torch.Tensor, torch.Tensor
 ]  # x (M, n, obs_dim), x' (M, n, obs_dim), log-density (M, n)
@@ -39,26 +46,49 @@ class AIRLSettings:
     n_iterations: int = 30
     episodes: int = 8  # per strategy and iteration
     discount: float = 0.99  # gamma, in f and for the policy
-    policy_reward: str = "g"  # "g" as in the paper, or "f_minus_log_pi" = log D - log(1 - D)
-    warm_start: bool = True  # start from behavioural cloning (the paper: off)
-    cloning_weight: float = (
-        1.0  # weight of the demonstration's negative log-likelihood in the policy loss (the paper: 0)
-    )
+    start: str = "clone"  # policies start from behavioural cloning and stay near it, or from "nothing"
+    first_sigma: float = 0.2  # of an untrained policy, share of half the action range
+    policy_base: str = "g"  # what the policy is paid: "g" as in the paper, or "f" ...
+    entropy_weight: float = 0.0  # ... less this weight c times log pi; "f" with c = 1 is log D - log(1 - D)
+    entropy_tuning: float = 0.0  # how fast c follows the demonstrations (``tune_entropy``); 0: c is fixed
+    cloning_weight: float = 1.0  # of the demonstration's negative log-likelihood in a clone's loss
     cloning_steps: int = 2000
-    coverage: bool = (
-        True  # half of the discriminator's policy samples are of wide exploratory rollouts (the paper: off)
+    coverage: str = (
+        "half"  # exploratory rollouts: half of the discriminator's samples, or "once" in the replay
     )
-    coverage_episodes: int = 2  # of the untrained policy and of the clone at each level
+    coverage_episodes: int = 2  # of the untrained policy and at each level of the clone (of it, without one)
     coverage_levels: tuple[tuple[float, float], ...] = ()  # as ``Exploration.levels``; (): the domain's
     discriminator_steps: int = 12
     discriminator_batch: int = 256  # demonstration samples per strategy and step, and as many others
     discriminator_rate: float = 3e-3
-    replay_iterations: int = 10  # policy samples of so many iterations are kept
+    penalty_weight: float = 0.0  # of the gradient penalty on the reward
+    penalty_slope: float = 1.0  # up to which it is free
+    penalty_points: str = "between"  # a demonstration's and a sample's state; or "samples", "demonstrations"
+    first_horizon: int = (
+        0  # episodes grow from so many steps, as the policies earn it; 0: whole from the start
+    )
+    growth: float = 1.05  # of an episode, whenever ...
+    grow_below: float = 0.75  # ... the discriminator's smoothed accuracy (its 70 % quantile) is below this
+    replay_iterations: int = 10  # policy samples of so many iterations are kept; 0: of all, thinned
     replay_samples: int = 2000  # per strategy and iteration
+    n_iterates: int = 0  # rewards kept for their mean (``mean_of_iterates``), spread over the iterations
     reward_average: float = (
         0.9  # decay of the running average of the reward's weights; 0 keeps the last iterate
     )
     ppo: PPOSettings = PPOSettings(learning_rate=1e-4, epochs=1, sample_fraction=0.5)
+
+    def __post_init__(self) -> None:
+        for name, words in WORDS.items():
+            if getattr(self, name) not in words:
+                raise InputError(f"{name} {getattr(self, name)!r}: expected one of {', '.join(words)}")
+        for name in ("penalty_weight", "entropy_weight", "cloning_weight"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"{name} {getattr(self, name)!r}: expected a number of at least 0")
+        if not self.penalty_slope > 0:
+            raise InputError(f"penalty_slope {self.penalty_slope!r}: expected a positive number")
+        if self.growth < 1 or self.first_horizon < 0:
+            text = "expected a growth of at least 1 from a first horizon of at least 0 steps"
+            raise InputError(f"growth {self.growth!r} from first_horizon {self.first_horizon!r}: {text}")
 
 
 class Rewards(torch.nn.Module):
@@ -118,6 +148,21 @@ class Rewards(torch.nn.Module):
         return self.evaluate(demonstrations.observations).mean((2, 3))
 
 
+class MeanRewards:
+    """The mean of several reward functions, not of their weights: what teaches fresh policies (lesson 02)."""
+
+    def __init__(self, iterates: Sequence[Rewards]):
+        self.iterates, self.domain = iterates, iterates[0].domain
+
+    def evaluate(self, observations: np.ndarray, part: str = "g") -> np.ndarray:
+        """As ``Rewards.evaluate``."""
+        return np.mean([rewards.evaluate(observations, part) for rewards in self.iterates], 0)
+
+    def mean_rewards(self, demonstrations: DemonstrationSet) -> np.ndarray:
+        """As ``Rewards.mean_rewards``."""
+        return self.evaluate(demonstrations.observations).mean((2, 3))
+
+
 def discriminator_loss(demonstration_logits: torch.Tensor, sample_logits: torch.Tensor) -> torch.Tensor:
     """``-E_demo[log D] - E_samples[log(1 - D)]`` per strategy from logits (M, n): (M,) nats."""
     softplus = torch.nn.functional.softplus
@@ -147,6 +192,9 @@ def clone_demonstrations(
 class AIRL:
     """One batched AIRL model per demonstration; ``train`` yields a record per iteration.
 
+    From a clone it is the fast way. From nothing, as in the paper, it needs the gradient penalty and episodes
+    that grow, or the discriminator is always right and nobody learns (lesson 02).
+
     After training: ``policies`` (GaussianPolicies), ``rewards`` (the last iterate), ``averaged_rewards`` (the
     running average, to be used), ``clone`` (Actor of behavioural cloning), ``steps`` per strategy so far.
     ``networks``: those of an earlier learner (``networks()``) instead of a clone to start from. ``shared``:
@@ -165,9 +213,6 @@ class AIRL:
         networks: dict[str, torch.Tensor] | None = None,
         shared: Rewards | None = None,
     ):
-        if settings.policy_reward not in POLICY_REWARDS:
-            text = f"policy_reward {settings.policy_reward!r}: expected one of {', '.join(POLICY_REWARDS)}"
-            raise InputError(text)
         self.domain, self.settings = demonstrations.domain, settings
         self.seed = seed = extend(
             seed, 101
@@ -176,9 +221,11 @@ class AIRL:
         states, actions, successors = demonstrations.transitions()
         self.x, self.x_next = (to_tensor(self.domain.network_input(s)) for s in (states, successors))
         self.actions = to_tensor(actions)
-        m = demonstrations.n_demonstrations
+        m, k = demonstrations.n_demonstrations, demonstrations.observations.shape[1]
+        self.time = np.tile(np.arange(states.shape[1] // k), k)  # of each shown state within its trajectory
+        self.length = float(min(settings.first_horizon or self.horizon, self.horizon))  # of an episode now
         self.alpha = self.alpha if shared is None else shared.alpha
-        self.policies = GaussianPolicies(self.domain, m, [*seed, 0])
+        self.policies = GaussianPolicies(self.domain, m, [*seed, 0], settings.first_sigma)
         self.rewards, self.averaged_rewards = (
             Rewards(self.domain, m, settings.discount, [*seed, 2], self.alpha) for _ in range(2)
         )
@@ -186,15 +233,20 @@ class AIRL:
             for rewards in (self.rewards, self.averaged_rewards):
                 rewards.task_reward.load_state_dict(shared.task_reward.state_dict())
                 rewards.task_reward.requires_grad_(False)
-        self.replay: deque[Samples] = deque(maxlen=settings.replay_iterations)
+        self.replay: deque[Samples] = deque(maxlen=settings.replay_iterations or None)
         self.coverage: list[Samples] = []
+        self.iterates: list[Rewards] = []
+        self.every = self.thinning = 1  # which iterations and samples are kept
+        self.entropy_weights = np.full(m, settings.entropy_weight)  # c of each strategy
+        self.smoothed: np.ndarray | None = None  # accuracy of the discriminator (M,)
         self.steps = self.iteration = self.n_averaged = 0
         self.clone: Actor | None = None
         self.untrained = self.policies.actor()
-        if networks is None and (settings.warm_start or settings.coverage):
-            cloned, self.cloning_curve = clone_demonstrations(demonstrations, seed, settings.cloning_steps)
-            self.clone = cloned.actor()
-            self.policies = cloned if settings.warm_start else self.policies
+        if networks is None and settings.start == "clone":
+            self.policies, self.cloning_curve = clone_demonstrations(
+                demonstrations, seed, settings.cloning_steps
+            )
+            self.clone = self.policies.actor()
         self.optimizer = PolicyOptimizer(
             self.policies, replace(settings.ppo, discount=settings.discount), [*seed, 3]
         )
@@ -221,49 +273,96 @@ class AIRL:
     def train(self, progress: Callable = iter) -> Iterator[dict]:
         """Run the iterations that are left; ``progress`` wraps the range (``tqdm`` for a bar).
 
-        record: iteration; steps (per strategy, coverage included); discriminator_loss, accuracy and
-        environment_return (M,) each - the return is for reading only and trains nothing; seconds by part.
+        record: iteration; horizon of its episodes; steps (per strategy, coverage included);
+        discriminator_loss, accuracy, environment_return and sigma (M,) each - the return is for reading only
+        and trains nothing; seconds by part.
         """
-        if self.settings.coverage and not self.coverage:
+        s = self.settings
+        if s.coverage != "none" and not self.coverage and not self.iteration:
             self._explore()
-        for iteration in progress(range(self.iteration, self.settings.n_iterations)):
+        for iteration in progress(range(self.iteration, s.n_iterations)):
             clock = [time.perf_counter()]
             seeds = [[*self.seed, part, iteration] for part in (10, 11, 12, 13)]
-            actor = self.policies.actor()
-            data = rollout(self.domain, actor, self.settings.episodes, seeds[0], horizon=self.horizon)
+            actor, horizon = self.policies.actor(), int(self.length)
+            episodes = max(
+                s.episodes, min(100, s.episodes * self.horizon // (2 * horizon))
+            )  # many, while short
+            data = rollout(self.domain, actor, episodes, seeds[0], horizon=horizon)
             self.steps += data.n_steps // len(self.x)
             clock.append(time.perf_counter())
-            self.replay.append(self._samples(data, actor, self.settings.replay_samples, seeds[1]))
+            self._remember(self._samples(data, actor, s.replay_samples, seeds[1]))
             loss, accuracy = self._discriminate(seeds[2])
-            self._average()
+            self._average(iteration)
+            self._grow(accuracy, iteration)
             clock.append(time.perf_counter())
             if self.learns_policies:
-                shown, weight = (self.x, self.actions), self.settings.cloning_weight
+                shown, weight = (self.x, self.actions), s.cloning_weight if s.start == "clone" else 0.0
                 paid = self.policy_rewards(data)
                 self.optimizer.update(data, paid, seeds[3], demonstrations=shown, cloning_weight=weight)
             clock.append(time.perf_counter())
             self.iteration = iteration + 1  # a reader may stop here and call ``train`` again
             yield {
                 "iteration": iteration,
+                "horizon": horizon,
                 "steps": self.steps,
                 "discriminator_loss": loss,
                 "accuracy": accuracy,
                 "environment_return": data.returns.mean(1),
+                "sigma": actor.sigma.mean((1, 2)),
+                "entropy_weight": self.entropy_weights,
                 "seconds": dict(zip(("rollouts", "discriminator", "policy"), np.diff(clock), strict=True)),
             }
 
     @one_thread()
     def policy_rewards(self, data: Rollouts) -> np.ndarray:
-        """What the policy is paid: ``R_j(s')`` of the state reached, or ``f - log pi``; (M, E, T)."""
+        """What the policy is paid: ``R_j(s')`` of the state reached, or f, less ``c log pi``; (M, E, T)."""
         m, e, t = data.rewards.shape
         x = to_tensor(self.domain.network_input(data.observations)).view(m, e, t + 1, -1)
         before, after = (part.reshape(m, e * t, -1) for part in (x[:, :, :-1], x[:, :, 1:]))
         with torch.no_grad():
-            if self.settings.policy_reward == "g":
-                return self.rewards.total(after).view(m, e, t).numpy()
-            actions = to_tensor(data.executed_actions).view(m, e * t, -1)
-            logits = self.rewards.f(before, after) - self.policies.log_density(before, actions)
-            return logits.view(m, e, t).numpy()
+            paid = (
+                self.rewards.total(after)
+                if self.settings.policy_base == "g"
+                else self.rewards.f(before, after)
+            )
+            if self.settings.entropy_weight:
+                actions = to_tensor(data.executed_actions).view(m, e * t, -1)
+                log_pi = self.policies.log_density(before, actions)
+                self.tune_entropy(log_pi.mean(1).numpy())
+                paid = paid - to_tensor(self.entropy_weights)[:, None] * log_pi
+            return paid.view(m, e, t).numpy()
+
+    @torch.no_grad()
+    def tune_entropy(self, own: np.ndarray) -> None:
+        """``c <- c exp(-rate (E_demo[log pi] - E_pi[log pi]))`` within 0.002 and 0.1; ``own`` (M,) is E_pi.
+
+        The two are equal where sigma is that of the demonstrated actions around the policy's mean: a policy
+        that is wider finds what was shown likelier than what it does, and c falls.
+        """
+        if self.settings.entropy_tuning:
+            near = np.flatnonzero(self.time < int(self.length))
+            shown = self.policies.log_density(self.x[:, near], self.actions[:, near]).mean(1).numpy()
+            change = np.exp(-self.settings.entropy_tuning * np.clip(shown - own, -1, 1))
+            self.entropy_weights = np.clip(self.entropy_weights * change, 0.002, 0.1)
+
+    def _remember(self, new: Samples) -> None:
+        """Into the replay; of all iterations' samples every second is dropped whenever they get too many."""
+        self.replay.append(
+            (new[0][:, :: self.thinning], new[1][:, :: self.thinning], new[2][:, :: self.thinning])
+        )
+        held = sum(x.shape[1] for x, *_ in self.replay)
+        if not self.settings.replay_iterations and held > REPLAY_SIZE:
+            self.thinning *= 2
+            self.replay = deque(
+                (x[:, ::2], x_next[:, ::2], log_pi[:, ::2]) for x, x_next, log_pi in self.replay
+            )
+
+    def _grow(self, accuracy: np.ndarray, iteration: int) -> None:
+        """Longer episodes once the discriminator can no longer tell policies from demonstrations."""
+        before = accuracy if self.smoothed is None else self.smoothed
+        self.smoothed = 0.7 * before + 0.3 * accuracy
+        if iteration >= 10 and np.quantile(self.smoothed, 0.7) < self.settings.grow_below:
+            self.length = min(self.horizon, self.length * self.settings.growth)
 
     def _samples(self, data: Rollouts, actor: Policies, n_samples: int, seed: Seed) -> Samples:
         """``n_samples`` transitions per strategy: x, x', and the log-density they were drawn with."""
@@ -276,15 +375,21 @@ class AIRL:
         return x, x_next, to_tensor(log_pi)
 
     def _explore(self) -> None:
-        """Coverage: rollouts of the untrained policy and of the clone, made worse in several ways, once."""
+        """Coverage: rollouts of the untrained policy and of the clone, made worse in several ways, once.
+
+        Without a clone it is the untrained policy that is made worse.
+        """
         s, rng = self.settings, np.random.default_rng([*self.seed, 6])
-        levels, clone = s.coverage_levels or self.domain.exploration.levels, self.clone
-        assert clone is not None
-        actor = Actor.joined([self.untrained, *(clone.disturbed(*level, rng) for level in levels)])
+        levels, known = s.coverage_levels or self.domain.exploration.levels, self.clone or self.untrained
+        actor = Actor.joined([self.untrained, *(known.disturbed(*level, rng) for level in levels)])
         data = rollout(self.domain, actor, s.coverage_episodes, [*self.seed, 4], horizon=self.horizon)
         self.steps += data.n_steps // len(self.x)
         parts = self._samples(data, actor, s.replay_samples, [*self.seed, 5])
-        self.coverage = list(zip(*(part.split(len(self.x)) for part in parts), strict=True))
+        sources = list(zip(*(part.split(len(self.x)) for part in parts), strict=True))
+        if s.coverage == "half":
+            self.coverage = sources
+        else:
+            self.replay.extend(sources)
 
     @staticmethod
     def _joined(sources: Sequence[Samples]) -> Samples:
@@ -299,9 +404,10 @@ class AIRL:
             log_pi = self.policies.log_density(
                 self.x, self.actions
             )  # of the demonstrations, under the current policy
-        pools = [self._joined(list(self.replay)), *([self._joined(self.coverage)] if s.coverage else [])]
+        pools = [self._joined(list(self.replay)), *([self._joined(self.coverage)] if self.coverage else [])]
+        near = np.flatnonzero(self.time < int(self.length))  # what an episode of this length can reach
         for _ in range(s.discriminator_steps):
-            pick = torch.from_numpy(rng.integers(0, self.x.shape[1], s.discriminator_batch))
+            pick = torch.from_numpy(near[rng.integers(0, len(near), s.discriminator_batch)])
             drawn = [[part[:, pick] for part in (self.x, self.x_next, log_pi)]]
             for pool in pools:
                 some = torch.from_numpy(
@@ -313,7 +419,11 @@ class AIRL:
             demonstration, samples = logits[:, : s.discriminator_batch], logits[:, s.discriminator_batch :]
             loss = discriminator_loss(demonstration, samples)
             self.reward_optimizer.zero_grad()
-            (loss.sum() + self.regularizer(drawn[1][0], rng)).backward()
+            extra = self.regularizer(drawn[1][0], rng)
+            if s.penalty_weight:
+                shown, reached = x[:, : 2 * (x.shape[1] // 2)].chunk(2, 1)
+                extra = extra + s.penalty_weight * self.gradient_penalty(shown, reached, rng).sum()
+            (loss.sum() + extra).backward()
             self.reward_optimizer.step()
         accuracy = ((demonstration > 0).float().mean(1) + (samples < 0).float().mean(1)) / 2
         return loss.detach().numpy().copy(), accuracy.numpy()
@@ -322,8 +432,31 @@ class AIRL:
         """What a subclass adds to a step's loss; ``x_samples`` (M, n, obs_dim): reached by the policies."""
         return torch.zeros(())
 
+    def gradient_penalty(
+        self, shown: torch.Tensor, samples: torch.Tensor, rng: np.random.Generator
+    ) -> torch.Tensor:
+        """``E max(0, |d R_j / d x| - slope)^2`` at network inputs x, (M,): shown and samples (M, n, obs_dim).
+
+        ``between``: at random points on the lines between pairs of them (Gulrajani et al., 2017, one-sided).
+        """
+        share = {"samples": 0.0, "demonstrations": 1.0}.get(self.settings.penalty_points)
+        drawn = (
+            torch.from_numpy(rng.random((*shown.shape[:2], 1), dtype=np.float32)) if share is None else share
+        )
+        x = (drawn * shown + (1 - drawn) * samples).requires_grad_(True)
+        slope = torch.autograd.grad(self.rewards.total(x).sum(), x, create_graph=True)[0].norm(dim=-1)
+        return (slope - self.settings.penalty_slope).clamp(min=0).square().mean(1)
+
+    def mean_of_iterates(self, share: float = 1.0) -> "MeanRewards":
+        """The mean of the reward functions over (the first ``share`` of) the iterations so far."""
+        return MeanRewards(self.iterates[: max(1, round(share * len(self.iterates)))])
+
     @torch.no_grad()
-    def _average(self) -> None:
+    def _average(self, iteration: int = 0) -> None:
+        if self.settings.n_iterates and iteration % self.every == 0:
+            self.iterates.append(copy.deepcopy(self.rewards))
+            if len(self.iterates) > self.settings.n_iterates:
+                self.iterates, self.every = self.iterates[::2], 2 * self.every
         decay = min(
             self.settings.reward_average, self.n_averaged / (self.n_averaged + 3)
         )  # forgets the start faster

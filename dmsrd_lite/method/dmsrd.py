@@ -43,8 +43,8 @@ class DMSRDSettings:
             expected = "expected a positive number of nats, or 0 to calibrate it"
             raise InputError(f"kl_threshold {self.kl_threshold!r}: {expected}")
         if self.airl.coverage != self.msrd.coverage:
-            expected = "expected both or neither, because MSRD goes on with AIRL's"
-            raise InputError(f"coverage is on in only one of airl and msrd: {expected}")
+            expected = "expected the same, because MSRD goes on with AIRL's"
+            raise InputError(f"coverage differs between airl and msrd: {expected}")
 
 
 def learn(state: State, demonstrations: DemonstrationSet, settings: DMSRDSettings) -> Iterator[State]:
@@ -114,9 +114,9 @@ def _check(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> None
             expected = f"expected {before} (trajectories, steps, dimension) as before"
             raise InputError(f"a demonstration with {array} of shape {now} arrived; {expected}")
     coverage = settings.msrd.coverage
-    if state.networks and ("coverage.0" in state.networks) != coverage:
+    if state.networks and ("coverage.0" in state.networks) != (coverage == "half"):
         expected = "expected the same in both"
-        raise InputError(f"coverage is {coverage} in the settings, and not so in the state; {expected}")
+        raise InputError(f"coverage is {coverage!r} in the settings, and not so in the state; {expected}")
 
 
 def _audited(state: State, settings: DMSRDSettings) -> State:

@@ -36,6 +36,6 @@ def reference_divergence(
     if not comparison.matched_starts:
         own = own_divergence(new.domain, new.observations[0])
         return own if np.isfinite(own) else comparison.own_at_most
-    clone = candidate().clone or AIRL(new, replace(settings.airl, warm_start=True), seed).clone
+    clone = candidate().clone or AIRL(new, replace(settings.airl, start="clone"), seed).clone
     assert clone is not None
     return float(policy_divergences(clone, new, seed)[0])

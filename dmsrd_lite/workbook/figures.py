@@ -7,6 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import seaborn
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from dmsrd_lite.domains import Domain
 from dmsrd_lite.domains.domain import Drawing, InputError
@@ -77,6 +78,24 @@ def plot_phase(
         ax.plot(*states[-1, [a, b]], **style, markersize=6, markeredgecolor="black", linestyle="none")
     ax.set(xlabel=domain.observation_names[a], ylabel=domain.observation_names[b])
     return ax
+
+
+def plot_people(domain: Domain, observations: np.ndarray, kinds: Sequence[str], columns: int = 5) -> Figure:
+    """A small phase portrait of each person (n, k, T, obs_dim), in the colour of their kind."""
+    a, b = drawing_of(domain).phase_axes
+    rows, names = -(-len(observations) // columns), sorted(set(kinds))
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(9, 1.9 * rows + 0.4), sharex=True, sharey=True, squeeze=False
+    )
+    for ax in axes.flat[len(observations) :]:
+        ax.set_axis_off()
+    for j, (states, kind) in enumerate(zip(observations, kinds, strict=True)):
+        color = STRATEGY_COLORS[names.index(kind) % 10]
+        axes.flat[j].plot(states[..., a].T, states[..., b].T, linewidth=0.6, color=color)
+        axes.flat[j].set_title(f"{j} {kind}" if len(observations) > 3 else kind, fontsize=9)
+    figure.supxlabel(domain.observation_names[a], fontsize=10)
+    figure.supylabel(domain.observation_names[b], fontsize=10)
+    return figure
 
 
 def reward_grid(domain: Domain, n: int = 61) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from dmsrd_lite.demonstrators.diayn import DiaynSettings
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.evaluation.comparison import MethodSettings
 from dmsrd_lite.learning.policy_optimization import PPOSettings, TrainingSettings
-from dmsrd_lite.method.airl import POLICY_REWARDS, AIRLSettings
+from dmsrd_lite.method.airl import AIRLSettings
 from dmsrd_lite.method.dmsrd import DMSRDSettings
 from dmsrd_lite.method.msrd import MSRDSettings
 from dmsrd_lite.method.policy_mixture import MixtureSettings
@@ -33,7 +33,11 @@ TRAINING = {PENDULUM: TrainingSettings(), LANDER: _FLIGHT}
 # Demonstrators and test sets (``python -m dmsrd_lite generate``).
 _PILOTS = replace(_FLIGHT, n_strategies=20, n_iterations=240, last_rate=0.1)
 DEMONSTRATORS = {
-    PENDULUM: DiaynSettings(),
+    PENDULUM: DiaynSettings(
+        diversity_weight=0.15,
+        acting_noise=0.9,
+        training=TrainingSettings(n_strategies=10, n_iterations=160, episodes=4, last_rate=0.1),
+    ),
     LANDER: DiaynSettings(diversity_weight=0.06, training=_PILOTS, attempts=4),
 }
 
@@ -47,6 +51,32 @@ TEST_SETS = {name: _for_test_sets(usual) for name, usual in DEMONSTRATORS.items(
 # The search for a mixture (Equation 3): candidates, then refinements around the best of them.
 MIXTURE = {PENDULUM: MixtureSettings(64, 32), LANDER: MixtureSettings(64, 32)}
 QUICK_MIXTURE = MixtureSettings(24, 16, n_finalists=5)
+
+# AIRL and MSRD from nothing: what makes them learn stands in lesson 02.
+_FROM_NOTHING: dict[str, dict[str, Any]] = {
+    PENDULUM: {
+        "n_iterations": 125, "discriminator_rate": 1e-3, "coverage": "none", "first_horizon": 30,
+        "entropy_weight": 0.05, "ppo": PPOSettings(epochs=4),
+    },
+    LANDER: {
+        "n_iterations": 100, "episodes": 10, "entropy_weight": 0.05, "first_sigma": 0.5,
+        "coverage": "once", "replay_iterations": 0,
+        "coverage_levels": ((1.0, 0.5), (1.0, 1.0), (1.0, 2.0)), "ppo": PPOSettings(epochs=4, minibatch=500),
+    },
+}  # fmt: skip
+
+
+def from_nothing(domain: str, settings: AIRLSettings, **changes: Any) -> Any:
+    """``settings`` (of AIRL or MSRD) from nothing: penalty, growing episodes, mean of iterates."""
+    usual = {
+        "start": "nothing",
+        "penalty_weight": 1.0,
+        "n_iterates": 32,
+        "entropy_tuning": 0.1,
+        **_FROM_NOTHING[domain],
+    }
+    return replace(settings, **{**usual, **_FROM_NOTHING[domain], **changes})
+
 
 # The methods of the comparison. Lander: as many updates of R_Task as DMSRD makes in all; more make it worse.
 _LANDER_ROUND = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=6)
@@ -68,12 +98,16 @@ class Start:  # 00
 @dataclass(frozen=True)
 class Demonstrations:  # 01
     n_frames: int  # of the video
+    fit_steps: int  # of the reward fitted to true returns
     diayn: DiaynSettings  # a small training run; its episodes stay short
 
 
 @dataclass(frozen=True)
 class AIRLLesson:  # 02
+    domain: str
     n_demonstrations: int
+    nothing_iterations: int
+    n_frames: int  # of the video
     airl: AIRLSettings
     fresh: TrainingSettings  # policies on the frozen reward
 
@@ -84,16 +118,25 @@ class AIRLLesson:  # 02
 
     @property
     def without_coverage(self) -> AIRLSettings:
-        return replace(self.batch, coverage=False)
+        return replace(self.batch, coverage="none")
 
     @property
-    def near_misses(self) -> AIRLSettings:
-        return replace(self.batch, coverage_levels=((1.0, 0.0), (3.0, 0.0)))
+    def nothing(self) -> AIRLSettings:
+        """One user, from nothing."""
+        return from_nothing(self.domain, AIRLSettings(), n_iterations=self.nothing_iterations)
+
+    @property
+    def whole_episodes(self) -> AIRLSettings:
+        return replace(self.nothing, first_horizon=0, n_iterations=20)
 
     @property
     def paid(self) -> dict[str, AIRLSettings]:
         """What the policy is paid, without the cloning term."""
-        return {name: replace(self.airl, policy_reward=name, cloning_weight=0.0) for name in POLICY_REWARDS}
+        paid = {"g": ("g", 0.0), "f - log pi": ("f", 1.0)}
+        return {
+            name: replace(self.airl, policy_base=base, entropy_weight=c, cloning_weight=0.0)
+            for name, (base, c) in paid.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -192,21 +235,23 @@ def _dmsrd(domain: str, quick: bool) -> DMSRDLesson:
     airl = AIRLSettings(n_iterations=4, episodes=4, cloning_steps=1000, coverage_episodes=1)
     msrd = replace(methods.dmsrd.msrd, n_iterations=3, episodes=2, discriminator_steps=24)
     loop = replace(methods.dmsrd, airl=airl, msrd=msrd, mixture=MixtureSettings(12, 8, n_finalists=3))
-    return DMSRDLesson((0, 1, 5), ((0.5, 0.5, 0.0), (0.3, 0.0, 0.7)), (), replace(methods, dmsrd=loop), fresh)
+    return DMSRDLesson((0, 1, 2), ((0.5, 0.5, 0.0), (0.3, 0.0, 0.7)), (), replace(methods, dmsrd=loop), fresh)
 
 
 def _airl(domain: str, quick: bool) -> AIRLLesson:
     fresh = replace(TRAINING[domain], n_strategies=10, n_iterations=120, hold=0.5, growing=0.9)
     if not quick:
-        return AIRLLesson(10, AIRLSettings(), fresh)
+        return AIRLLesson(domain, 10, 125 if domain == PENDULUM else 200, 500, AIRLSettings(), fresh)
     fresh = replace(
         fresh, n_strategies=5, n_iterations=8, episodes=2, first_horizon=100, growing=1e9
     )  # short episodes
-    return AIRLLesson(3, AIRLSettings(n_iterations=6, episodes=4, cloning_steps=1000), fresh)
+    return AIRLLesson(
+        domain, 3, 100, 200, AIRLSettings(n_iterations=6, episodes=4, cloning_steps=1000), fresh
+    )
 
 
 def _users(quick: bool) -> tuple[int, ...]:
-    return (0, 1, 5) if quick else tuple(range(10))
+    return (0, 1, 2) if quick else tuple(range(10))
 
 
 def _small(quick: bool, episodes: int) -> dict[str, Any]:
@@ -217,12 +262,13 @@ _SHORT = TrainingSettings(n_strategies=4, episodes=5, growing=1e9)
 LESSONS: dict[str, Any] = {  # (domain, quick) -> settings
     "00_start_here": lambda domain, quick: Start(5 if quick else 20),
     "01_demonstrations": lambda domain, quick: Demonstrations(
-        300 if quick else 1000, DiaynSettings(training=replace(_SHORT, n_iterations=40 if quick else 120))),
+        300 if quick else 1000, 200 if quick else 2000,
+        DiaynSettings(training=replace(_SHORT, n_iterations=40 if quick else 120))),
     "02_airl": _airl,
     "03_msrd": lambda domain, quick: MSRDLesson(_users(quick), MSRDSettings(
         n_iterations=9 if quick else 25, discriminator_steps=24, **_small(quick, 8))),
     "04_policy_mixture": lambda domain, quick: MixtureLesson(
-        (0, 1), 0.5, QUICK_MIXTURE if quick else MIXTURE[domain]),
+        (4, 8) if domain == PENDULUM else (0, 1), 0.5, QUICK_MIXTURE if quick else MIXTURE[domain]),
     "05_between_class_discrimination": lambda domain, quick: DiscriminationLesson(
         _users(quick), 2 if quick else 5,
         MSRDSettings(n_iterations=9 if quick else 20, discriminator_steps=24, **_small(quick, 4))),

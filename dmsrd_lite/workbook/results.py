@@ -8,34 +8,22 @@ import numpy as np
 import pandas as pd
 
 from dmsrd_lite.demonstrations import write_atomically
-from dmsrd_lite.domains import DOMAINS, InputError
-from dmsrd_lite.evaluation.comparison import METHODS
+from dmsrd_lite.domains import DOMAINS
 from dmsrd_lite.workbook.lessons import lessons
 from dmsrd_lite.workbook.records import RECORDS, ROOT, load_record
 
 README = ROOT / "papermill_runs" / "README.md"
 BEGIN, END = "<!-- parameters: made by python -m dmsrd_lite results -->", "<!-- end of parameters -->"
-COLUMNS = ("record", "lesson", "domain", "seed", "method", "metric", "value")
-PAGE = {  # what the page calls records -> their names
-    "alone": "02_airl_inverted_pendulum_seed0",
-    "pendulum": "06_dmsrd_inverted_pendulum_seed[0-9]",
-    "lander": "06_dmsrd_lunar_lander_seed[0-9]",
-    "pendulum_stream": "08_lifelong_inverted_pendulum_seed[0-9]",
-    "lander_stream": "08_lifelong_lunar_lander_seed[0-9]",
-    "moving": "08_lifelong_inverted_pendulum_seed0_moving",
-    "forty": "08_lifelong_inverted_pendulum_seed0_users40_remembered[0-9]+",
+SHOWN = {
+    "divergence_above_floor": "KL above the floor (nats)",
+    "log_likelihood_above_own": "log-likelihood above the demonstrator's own (nats per step)",
+    "environment_return": "return",
+    "failure_share": "failures",
+    "task_correlation": "correlation of the task reward",
+    "recognized": "recognised",
 }
-MEANS = {"divergence_above_floor": ".2f", "log_likelihood_above_own": ".3f", "failure_share": ".0%",
-         "environment_return": ".1f"}  # fmt: skip
-RUN_BY_RUN = {"task_correlation": ".3f", "recognized": ".0%"}
 SINGLE = ("fresh_solved", "fresh_spared", "every_step", "weight_error", "peak_gb", "environment_steps")
-
-
-class Runs(list):
-    """One number for each run, formatted one by one: ``0.98 / 0.97``; ``-`` for no run."""
-
-    def __format__(self, form: str) -> str:
-        return " / ".join(format(value, form) for value in self) or "-"
+COLUMNS = ("record", "lesson", "domain", "seed", "method", "metric", "value")
 
 
 def write_results(folder: Path | None = None) -> list[Path]:
@@ -107,29 +95,15 @@ def _scores(r: dict) -> dict[str, dict[str, Any]]:
 
 
 def page(table: pd.DataFrame) -> str:
-    """``results.md`` with its placeholders (``{lander[DMSRD][task_correlation]:.3f}``) filled, run by run."""
-    values: dict = {"domains": DOMAINS}
-    for name, pattern in PAGE.items():
-        chosen = table[table["record"].str.fullmatch(pattern)]
-        values[name] = {}
-        for (method, metric), found in chosen.groupby(["method", "metric"], sort=False)["value"]:
-            values[name].setdefault(method, {})[metric] = Runs(found)
-        values[f"{name}_table"] = _table(values[name])
-    try:
-        return Path(__file__).with_suffix(".md").read_text("utf-8").format(**values)
-    except KeyError as name:
-        raise InputError(f"{RECORDS}: nothing about {name}; expected the repository's records") from None
-
-
-def _table(found: dict) -> str:
-    """A comparison: means over the runs, and what the rewards know run by run."""
+    """``results.md`` with the table of the records in its place: one row for each record and method."""
     rows = []
-    for method in (m + more for more in ("", ", as in the paper") for m in METHODS if m + more in found):
-        runs = {metric: found[method].get(metric, Runs()) for metric in (*MEANS, *RUN_BY_RUN)}
-        cells = [format(np.mean(runs[metric]), form) for metric, form in MEANS.items()]
-        cells += [format(runs[metric], form) for metric, form in RUN_BY_RUN.items()]
-        rows.append(f"| {method} | {' | '.join(cells)} |")
-    return "\n".join(rows)
+    for (record, method), found in table.groupby(["record", "method"], sort=False):
+        known = found.drop_duplicates("metric").set_index("metric")["value"]
+        cells = [f"{known[m]:.3g}" if m in known else "-" for m in SHOWN]
+        rows.append(f"| {record} | {method} | {' | '.join(cells)} |")
+    head = [f"| record | method | {' | '.join(SHOWN.values())} |", "|---" * (len(SHOWN) + 2) + "|"]
+    text = "\n".join([*head, *rows]) if rows else "*No record yet.*"
+    return Path(__file__).with_suffix(".md").read_text("utf-8").replace("{records}", text)
 
 
 def parameters() -> str:

@@ -34,12 +34,3 @@ def test_the_reward_as_written(domain):
     features = domain.diversity.features(data.observations) / population.feature_units
     log_q, _ = StrategyDiscriminator(2, 2, settings, [5, 2]).update(features.reshape(2, 90, 2), 6)
     assert np.allclose(paid, data.rewards + 0.7 * (log_q.reshape(2, 3, 30) - np.log(1 / 2)))
-
-
-def test_all_populations_demonstrate_with_less_noise(domain):
-    actor = diayn.train_all_demonstrators(domain, TINY, 0)
-    *_, last = diayn.train_demonstrators(domain, domain.diversity.populations[0], TINY, 0)
-    trained, states = last["policies"].actor(), np.random.default_rng(0).normal(size=(4, 5, 4))
-    assert actor.n_strategies == 4
-    assert np.array_equal(actor.mean(states)[:2], trained.mean(states[:2]))
-    assert np.array_equal(actor.sigma[:2], trained.sigma * np.float32(0.8))

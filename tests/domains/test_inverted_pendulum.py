@@ -1,7 +1,8 @@
 import gymnasium
 import numpy as np
+import pytest
 
-from dmsrd_lite.domains.inverted_pendulum import PendulumBatch
+from dmsrd_lite.domains.inverted_pendulum import CAP, OMEGA, PendulumBatch
 from dmsrd_lite.learning.networks import GaussianPolicies
 from dmsrd_lite.learning.rollouts import rollout
 
@@ -39,10 +40,31 @@ def test_frame_shows_the_state(domain):
     )
 
 
-def test_features_are_place_and_width_of_the_last_three_seconds(domain):
-    states = np.zeros((1, 201, 4))
-    states[0, :, 0] = np.where(np.arange(201) % 2, 0.3, 0.1)
-    states[0, 100:, 0] = 0.5
-    found = domain.diversity.features(states)
-    assert found.shape == (1, 200, 2)
-    assert found[0, [0, 98, 199]].tolist() == [[0.3, 0.3 - 0.1], [0.3, 0.3 - 0.1], [0.5, 0.0]]
+def test_the_swing_speed_knows_nothing_of_the_place(domain):
+    """Constant on a swing at the feature's own frequency, zero for who holds still, and bounded."""
+    t = np.arange(0, 40, 0.04)
+    swing = 0.2 * OMEGA * np.cos(OMEGA * t)
+    states = np.zeros((3, len(t), 4))
+    states[0, :, 0] = 0.7  # holds still
+    states[1, :, 0], states[1, :, 2] = -0.5 + 0.2 * np.sin(OMEGA * t), swing
+    states[1, :, 1] = -0.2 * OMEGA**2 * np.sin(OMEGA * t) / 9.81  # x'' = g theta
+    states[2, :, 1] = 1.5  # has fallen
+    place, speed = np.moveaxis(domain.diversity.features(states), -1, 0)
+    assert np.array_equal(place, states[:, 1:, 0])
+    assert np.allclose(speed[0], 0)
+    assert np.allclose(speed[1], 0.2 * OMEGA)
+    assert speed[2].max() == speed.max() == pytest.approx(CAP)
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "period", "kind"),
+    [(0.3, 3, "swinger"), (0.1, 2, "rocker"), (0.1, 20, "holder"), (0.4, 20, "drifter"), (0.02, 1, "holder")],
+)
+def test_kinds_are_computed_from_movement(domain, amplitude, period, kind):
+    states = np.zeros((2, 1001, 4))
+    states[..., 0] = 0.5 + amplitude * np.sin(2 * np.pi / period * 0.04 * np.arange(1001))
+    found = domain.diversity.describe(states)
+    assert found["kind"] == kind
+    assert found["deviation of x (m)"] == pytest.approx(amplitude / np.sqrt(2), rel=0.1)
+    assert found["mean x (m)"] == pytest.approx(0.5, abs=0.1)
+    assert found["period (s)"] == pytest.approx(period, rel=0.25)

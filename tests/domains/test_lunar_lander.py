@@ -1,5 +1,6 @@
 import gymnasium
 import numpy as np
+import pytest
 
 from dmsrd_lite.domains import LUNAR_LANDER
 from dmsrd_lite.learning.networks import GaussianPolicies
@@ -45,3 +46,15 @@ def test_frame_shows_the_state():
     body = [np.flatnonzero((f.astype(int).min(-1) > 240).any(1)) for f in (high, low)]
     assert high.shape == low.shape
     assert body[0].max() < body[1].min(), "a high lander is drawn above a low one"
+
+
+def test_a_pilot_is_described_by_side_time_and_lean():
+    states = np.zeros((2, 501, 8))
+    states[..., 0] = -0.3
+    states[..., 1] = np.maximum(1.4 - 0.01 * np.arange(501), 0)
+    states[:, 50, 4], states[:, 200:, 6] = -0.4, 1
+    states[:, 300:, 4] = 2.0  # after the first touch: is not counted
+    found = LUNAR_LANDER.diversity.describe(states)
+    assert found["kind"] == "slow, from the left"
+    assert (found["first touch (s)"], found["largest angle (rad)"]) == pytest.approx((4.0, 0.4))
+    assert found["side (half widths)"] == pytest.approx(-0.3)

@@ -63,8 +63,8 @@ def test_as_in_the_paper_switches_three_things_off_everywhere():
     for changed, usual in ((paper, ours), (paper.dmsrd, ours.dmsrd)):
         for part in ("airl", "msrd"):
             settings = getattr(changed, part)
-            assert (settings.warm_start, settings.cloning_weight, settings.coverage) == (False, 0.0, False)
-            back = replace(settings, warm_start=True, cloning_weight=1.0, coverage=True)
+            assert (settings.start, settings.coverage) == ("nothing", "none")
+            back = replace(settings, start="clone", coverage="half")
             assert back == getattr(usual, part), "and nothing else"
     assert (paper.dmsrd.add_task_reward, ours.dmsrd.add_task_reward) == (False, True)
 

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers import make_truth
-from scipy.stats import norm, pearsonr
+from scipy.stats import norm, pearsonr, spearmanr
 
-from dmsrd_lite.demonstrations import demonstrations_from
+from dmsrd_lite.demonstrations import RewardTestSet, demonstrations_from
 from dmsrd_lite.domains import LUNAR_LANDER
 from dmsrd_lite.evaluation import metrics
 from dmsrd_lite.learning.networks import SIGMA_FLOOR, Actor, GaussianPolicies
@@ -85,3 +85,30 @@ def test_the_ceiling_is_what_a_state_reward_can_know(domain):
     noise = dataclasses.replace(known, returns=np.random.default_rng(1).normal(size=600))
     found = metrics.fit_reward(noise, 0, 100)
     assert abs(metrics.correlations_on(held, found)[0]) < 0.6, "nothing can be known about noise"
+
+
+def test_three_correlations_tell_a_reward_that_only_knows_who_failed(domain):
+    """Half of the set has failed: Pearson is near 1 for it, ranks among those who stand say nothing."""
+    rng = np.random.default_rng(0)
+    failed = np.repeat([1, 0], 50)[:, None] * np.ones((1, 5), dtype=int)
+    returns = np.where(failed[:, 0], -1500.0, -rng.uniform(1, 60, 100))
+    states = 0.3 * rng.normal(size=(100, 5, 4)).astype(np.float32)
+    test_set = RewardTestSet(domain, states, returns, np.zeros(100), np.zeros(100), {}, failed=failed)
+    knows_failure = metrics.one_line_rewards(test_set)["has not failed"]
+    found = metrics.reward_correlations(test_set, knows_failure + 1e-6 * rng.normal(size=100))
+    assert found.pearson > 0.99
+    assert abs(found.spearman_of_good) < 0.3
+    perfect = metrics.reward_correlations(test_set, returns**3)
+    assert (perfect.spearman, perfect.spearman_of_good) == pytest.approx((1, 1))
+    plain = metrics.reward_correlations(test_set, knows_failure)
+    assert plain.spearman == pytest.approx(spearmanr(knows_failure, returns)[0])
+    assert np.isnan(plain.spearman_of_good), "it is constant among those who stand"
+    by_hand = spearmanr(knows_failure[50:] + states[50:, 0, 0], returns[50:])[0]
+    assert metrics.reward_correlations(test_set, states[:, 0, 0]).spearman_of_good == pytest.approx(by_hand)
+    unknown = dataclasses.replace(test_set, failed=None)
+    assert np.isnan(metrics.reward_correlations(unknown, returns).spearman_of_good)
+    x, whole = metrics.one_line_rewards(test_set)["-|x|"], metrics.one_line_rewards(test_set)["-|s|^2"]
+    assert x == pytest.approx(-np.abs(states[..., 0]).mean(1))
+    assert whole[3] == pytest.approx(
+        -np.mean(np.sum((states[3] / domain.observation_scale) ** 2, 1)), rel=1e-5
+    )

@@ -8,9 +8,15 @@ from tiny import AIRL_ONE, same
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.learning.networks import to_tensor
 from dmsrd_lite.learning.rollouts import rollout
+from dmsrd_lite.method import airl
 from dmsrd_lite.method.airl import AIRL, AIRLSettings, Rewards, clone_demonstrations, discriminator_loss
 
-AS_IN_THE_PAPER = {"warm_start": False, "cloning_weight": 0.0, "coverage": False}
+AS_IN_THE_PAPER = {"start": "nothing", "coverage": "none"}
+ONCE = {"start": "nothing", "coverage": "once"}
+FROM_NOTHING = {
+    "start": "nothing", "coverage": "once", "penalty_weight": 1.0, "first_horizon": 20,
+    "replay_iterations": 0, "n_iterates": 2, "entropy_weight": 0.05,
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -50,7 +56,8 @@ def test_g_is_bounded_with_unit_slope_at_zero_and_evaluated_at_raw_observations(
 
 
 @pytest.mark.parametrize(
-    "change", [{}, {"coverage_levels": ()}, {"policy_reward": "f_minus_log_pi"}, AS_IN_THE_PAPER]
+    "change",
+    [{}, {"coverage_levels": ()}, {"policy_base": "f", "entropy_weight": 1.0}, AS_IN_THE_PAPER, ONCE],
 )
 def test_a_tiny_run_counts_steps_and_is_deterministic(change, small_set):
     settings, runs = replace(AIRL_ONE, **change), []
@@ -60,7 +67,7 @@ def test_a_tiny_run_counts_steps_and_is_deterministic(change, small_set):
         records = list(learner.train())
         runs.append(learner.networks())
     levels = settings.coverage_levels or small_set.domain.exploration.levels
-    explored = (1 + len(levels)) * 50 if settings.coverage else 0
+    explored = (1 + len(levels)) * 50 if settings.coverage != "none" else 0
     assert [r["steps"] for r in records] == [explored + 50, explored + 100]
     for r in records:
         assert np.isfinite(r["discriminator_loss"]).all()
@@ -78,13 +85,14 @@ def test_stopping_and_going_on_equals_one_run(small_set):
     assert same(straight.networks(), broken.networks())
 
 
-def test_with_warm_start_the_policy_is_the_clone_and_without_it_untrained(small_set):
-    cold, warm = (AIRL(small_set, replace(AIRL_ONE, warm_start=w, discount=0.5), 0) for w in (False, True))
+def test_from_a_clone_the_policy_is_the_clone_and_from_nothing_untrained(small_set):
+    cold, warm = (AIRL(small_set, replace(AIRL_ONE, start=s, discount=0.5), 0) for s in ("nothing", "clone"))
+    assert cold.clone is None
     assert warm.optimizer.settings.discount == 0.5
     states = small_set.observations[:, 0, :5]
     assert np.array_equal(cold.policies.actor().mean(states), cold.untrained.mean(states))
     policies, curve = clone_demonstrations(small_set, [0, 101], AIRL_ONE.cloning_steps)
-    for clone in (warm.policies.actor(), warm.clone, cold.clone):
+    for clone in (warm.policies.actor(), warm.clone):
         assert np.array_equal(clone.mean(states), policies.actor().mean(states))
     assert curve.shape == (1, 2), "every 50 steps, each of two policies"
     other, _ = clone_demonstrations(small_set, [0, 101], AIRL_ONE.cloning_steps, streams=(5, 6))
@@ -105,16 +113,18 @@ def test_samples_keep_the_density_they_were_drawn_with(small_set):
     assert not torch.allclose(now[2], log_pi), "the policy must have moved, or this test says nothing"
 
 
-@pytest.mark.parametrize("kind", ["g", "f_minus_log_pi"])
-def test_what_the_policy_is_paid_by_hand(kind, small_set):
-    """``R(s')``, or ``log D - log(1 - D)`` with ``D = e^f / (e^f + pi)``."""
-    learner = AIRL(small_set, replace(AIRL_ONE, policy_reward=kind), 0)
+@pytest.mark.parametrize(("base", "c"), [("g", 0.0), ("g", 0.3), ("f", 1.0)])
+def test_what_the_policy_is_paid_by_hand(base, c, small_set):
+    """``R(s') - c log pi``, or ``log D - log(1 - D)`` with ``D = e^f / (e^f + pi)``."""
+    learner = AIRL(small_set, replace(AIRL_ONE, policy_base=base, entropy_weight=c), 0)
     data = rollout(small_set.domain, actor := learner.policies.actor(), 2, 0, horizon=20)
     states, actions = data.observations[:, 1], data.executed_actions[:, 1]
     x = to_tensor(small_set.domain.network_input(states))
     f = learner.rewards.f(x[:, :-1], x[:, 1:]).detach().numpy().astype(float)
-    d = np.exp(f) / (np.exp(f) + np.exp(actor.log_density(states[:, :-1], actions)))
-    by_hand = learner.rewards.g(x[:, 1:]).detach() if kind == "g" else np.log(d) - np.log(1 - d)
+    log_pi = actor.log_density(states[:, :-1], actions)
+    d = np.exp(f) / (np.exp(f) + np.exp(log_pi))
+    g = learner.rewards.g(x[:, 1:]).detach().numpy()
+    by_hand = g - c * log_pi if base == "g" else np.log(d) - np.log(1 - d)
     assert np.allclose(learner.policy_rewards(data)[:, 1], by_hand, atol=1e-4)
 
 
@@ -140,12 +150,129 @@ def test_the_discriminator_compares_f_with_log_pi_and_half_of_its_samples_are_co
 def test_the_discriminator_learns_to_tell_a_moved_demonstration(small_set):
     """Demonstrated states moved by 1 m: after training, g must prefer them."""
     moved = replace(small_set, observations=small_set.observations + np.array([1.0, 0, 0, 0]))
-    more = {"n_iterations": 3, "discriminator_steps": 30, "discriminator_batch": 64, "warm_start": False}
+    more = {
+        "n_iterations": 3,
+        "discriminator_steps": 30,
+        "discriminator_batch": 64,
+        "start": "nothing",
+        "coverage": "none",
+    }
     learner = AIRL(moved, replace(AIRL_ONE, **more), 0)
     list(learner.train())
     assert learner.rewards.mean_rewards(moved)[0, 0] > learner.rewards.mean_rewards(small_set)[0, 0]
 
 
-def test_unknown_policy_reward(small_set):
-    with pytest.raises(InputError, match=r"^policy_reward 'h': expected one of g, f_minus_log_pi$"):
-        AIRL(small_set, AIRLSettings(policy_reward="h"), 0)
+def test_the_gradient_penalty_by_finite_differences(small_set):
+    """Its value by differences of R, and its gradient in a weight by differences of it (double precision)."""
+    learner = AIRL(small_set, replace(AIRL_ONE, penalty_points="between", penalty_slope=0.2), 0)
+    learner.rewards.double()
+    shown, samples = (part.double() for part in learner.x.split(25, 1)[:2])
+    share = np.random.default_rng(7).random((*shown.shape[:2], 1), dtype=np.float32)
+    x = (share * shown.numpy() + (1 - share) * samples.numpy()).astype(np.float64)
+
+    def total(at):
+        return learner.rewards.total(torch.from_numpy(at)).detach().numpy()
+
+    moves = 1e-5 * np.eye(x.shape[-1])
+    slope = np.sqrt(sum(((total(x + d) - total(x - d)) / 2e-5) ** 2 for d in moves))
+    penalty = learner.gradient_penalty(shown, samples, np.random.default_rng(7))
+    assert penalty.detach().numpy() == pytest.approx((np.maximum(slope - 0.2, 0) ** 2).mean(1), rel=1e-4)
+    assert (slope > 0.2).any(), "or this test says nothing"
+    weight = learner.rewards.strategy_reward.weights[1]
+    penalty.sum().backward()
+    exact, found = weight.grad[0, 3, 5].item(), []
+    for step in (1e-5, -1e-5):
+        with torch.no_grad():
+            weight[0, 3, 5] += step
+        found.append(learner.gradient_penalty(shown, samples, np.random.default_rng(7)).sum().item())
+        with torch.no_grad():
+            weight[0, 3, 5] -= step
+    assert exact == pytest.approx((found[0] - found[1]) / 2e-5, rel=1e-3)
+
+
+def test_c_falls_while_the_policy_is_wider_than_what_was_shown(small_set):
+    settings = replace(AIRL_ONE, entropy_weight=0.05, entropy_tuning=0.1, start="nothing")
+    for sigma, direction in ((3.0, -1), (0.05, 1)):
+        learner = AIRL(replace(small_set, actions=0 * small_set.actions), settings, 0)
+        with torch.no_grad():
+            learner.policies.log_sigma.fill_(np.log(sigma))
+            learner.policies.network.weights[-1].zero_()
+        if direction == 1:
+            learner.actions += 0.3
+        own = np.full(2, -0.5 - np.log(sigma) - 0.5 * np.log(2 * np.pi))  # of its own samples
+        learner.tune_entropy(own)
+        assert (np.sign(learner.entropy_weights - 0.05) == direction).all()
+    shown = -0.5 * (0.3 / 0.05) ** 2 + 0.5  # above ``own``, by hand; the change is at most one nat
+    assert learner.entropy_weights == pytest.approx(0.05 * np.exp(0.1 * min(-shown, 1)))
+    fixed = AIRL(small_set, replace(settings, entropy_tuning=0.0), 0)
+    fixed.tune_entropy(own)
+    assert (fixed.entropy_weights == 0.05).all()
+
+
+def test_episodes_grow_when_the_discriminator_can_no_longer_tell(small_set):
+    learner = AIRL(small_set, replace(AIRL_ONE, first_horizon=20, growth=1.5, grow_below=0.75), 0)
+    for iteration in range(12):
+        learner._grow(np.array([0.9, 0.5]), iteration)
+    assert learner.length == 20, "the 70 % quantile of the two is above"
+    for _ in range(5):
+        learner._grow(np.array([0.5, 0.5]), 12)
+    assert 20 < learner.length <= 50
+    for _ in range(10):
+        learner._grow(np.array([0.5, 0.5]), 12)
+    assert learner.length == 50, "the demonstrations' own length"
+
+
+def test_short_episodes_are_compared_with_the_beginning_of_demonstrations(small_set, monkeypatch):
+    learner = AIRL(small_set, replace(AIRL_ONE, **FROM_NOTHING), 0)
+    seen, f = [], learner.rewards.f
+    monkeypatch.setattr(learner.rewards, "f", lambda x, y: seen.append(x) or f(x, y))
+    records = list(learner.train())
+    assert [r["horizon"] for r in records] == [20, 20]
+    early = learner.x[:, learner.time < 20]
+    for x in seen[:2]:
+        for row, known in zip(x[:, :16], early, strict=True):
+            assert all((known == state).all(1).any() for state in row)
+
+
+def test_the_replay_of_all_iterations_is_bounded_and_keeps_early_samples(small_set, monkeypatch):
+    monkeypatch.setattr(airl, "REPLAY_SIZE", 100)
+    learner = AIRL(small_set, replace(AIRL_ONE, replay_iterations=0), 0)
+    for number in range(9):
+        learner._remember(
+            tuple(torch.full(shape, float(number)) for shape in ((2, 30, 4), (2, 30, 4), (2, 30)))
+        )
+    held = torch.cat([log_pi for *_, log_pi in learner.replay], 1)[0]
+    assert len(held) <= 100
+    assert set(held.tolist()) == set(range(9))
+    sizes = [log_pi.shape[1] for *_, log_pi in learner.replay]
+    assert max(sizes) <= 1.2 * min(sizes), "as many of each iteration"
+
+
+def test_the_mean_of_iterates_is_of_functions_not_of_weights(small_set):
+    learner = AIRL(small_set, replace(AIRL_ONE, n_iterations=5, n_iterates=3), 0)
+    seen = []
+    for _ in learner.train():
+        seen.append(learner.rewards.evaluate(small_set.observations))
+    assert (len(learner.iterates), learner.every) == (3, 2), "bounded: iterations 0, 2, 4"
+    mean = learner.mean_of_iterates().evaluate(small_set.observations)
+    assert mean == pytest.approx(np.mean(seen[::2], 0), abs=1e-6)
+    assert learner.mean_of_iterates(0.34).evaluate(small_set.observations) == pytest.approx(seen[0], abs=1e-6)
+    means = learner.mean_of_iterates().mean_rewards(small_set)
+    assert means == pytest.approx(mean.mean((2, 3)), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"policy_base": "h"}, "policy_base 'h': expected one of g, f"),
+        ({"start": "warm"}, "start 'warm': expected one of clone, nothing"),
+        ({"coverage": True}, "coverage True: expected one of half, once, none"),
+        ({"penalty_weight": -1.0}, "penalty_weight -1.0: expected a number of at least 0"),
+        ({"entropy_weight": -0.1}, "entropy_weight -0.1: expected a number of at least 0"),
+        ({"penalty_slope": 0.0}, "penalty_slope 0.0: expected a positive number"),
+        ({"growth": 0.9}, "growth 0.9 from first_horizon 0: expected a growth of at least 1 from"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_sentence(change, sentence):
+    with pytest.raises(InputError, match=f"^{sentence}[^\\n]*$"):
+        AIRLSettings(**change)

@@ -15,7 +15,7 @@ from dmsrd_lite.domains import LUNAR_LANDER, InputError
 from dmsrd_lite.method import airl, divergence, dmsrd, kl_threshold, rounds
 from dmsrd_lite.method.state import State
 
-WITHOUT_COVERAGE = {name: replace(getattr(ROUGH, name), coverage=False) for name in ("airl", "msrd")}
+WITHOUT_COVERAGE = {name: replace(getattr(ROUGH, name), coverage="none") for name in ("airl", "msrd")}
 FIELDS = """demonstration branch kl_mix kl_new threshold reference weights n_strategies steps seconds
 remembered kl_before_round kl_after_round searched_again recognized"""
 
@@ -158,7 +158,8 @@ def test_the_threshold_is_calibrated_by_the_demonstration_itself(three, domain):
 def test_on_the_lander_the_clone_calibrates_the_threshold(lander_set, warm, monkeypatch):
     made, lander = watch(monkeypatch, dmsrd if warm else kl_threshold, "AIRL"), LUNAR_LANDER.on_threads(1)
     first = replace(lander_set.select([0]), domain=lander)
-    parts = {k: replace(getattr(ROUGH, k), warm_start=warm, coverage=warm) for k in ("airl", "msrd")}
+    kind = {"start": "clone", "coverage": "half"} if warm else {"start": "nothing", "coverage": "none"}
+    parts = {k: replace(getattr(ROUGH, k), **kind) for k in ("airl", "msrd")}
     (record,) = after(State(lander, 0), first, replace(TINY, kl_threshold=0.0, **parts)).records
     assert len(made) == 1, "the clone that AIRL starts from is the one that calibrates"
     clone = made[-1]["learner"].clone
@@ -169,7 +170,7 @@ def test_on_the_lander_the_clone_calibrates_the_threshold(lander_set, warm, monk
 BAD_SETTINGS = [
     *(({"kl_threshold": bad}, f"kl_threshold {bad}: expected a positive number of nats, or 0 to calibrate it")
       for bad in (-0.1, float("nan"), float("inf"))),
-    *(({name: part}, "coverage is on in only one of airl and msrd: expected both or neither, because")
+    *(({name: part}, "coverage differs between airl and msrd: expected the same, because")
       for name, part in WITHOUT_COVERAGE.items()),
 ]  # fmt: skip
 
@@ -184,7 +185,9 @@ def test_without_coverage(three, states):
     state = after(states[0], three.select([0]), replace(TINY, **WITHOUT_COVERAGE))
     assert state.networks.keys() == {name for name in states[1].networks if not name.startswith("coverage.")}
     assert state.records[0]["steps"]["airl"] == 50
-    with pytest.raises(InputError, match=r"^coverage is True in the settings, and not so in the state; exp"):
+    with pytest.raises(
+        InputError, match=r"^coverage is 'half' in the settings, and not so in the state; exp"
+    ):
         after(state, three.select([1]))
 
 
