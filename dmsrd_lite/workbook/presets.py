@@ -126,8 +126,14 @@ class AIRLLesson:  # 02
         return from_nothing(self.domain, AIRLSettings(), n_iterations=self.nothing_iterations)
 
     @property
-    def whole_episodes(self) -> AIRLSettings:
-        return replace(self.nothing, first_horizon=0, n_iterations=20)
+    def broken_name(self) -> str:
+        return "whole episodes" if self.nothing.first_horizon else "no penalty"
+
+    @property
+    def broken(self) -> AIRLSettings:
+        """Without what matters most: growing episodes, or where they are whole anyway, the penalty."""
+        change = {"first_horizon": 0} if self.nothing.first_horizon else {"penalty_weight": 0.0}
+        return replace(self.nothing, n_iterations=20, **change)
 
     @property
     def paid(self) -> dict[str, AIRLSettings]:
