@@ -339,6 +339,21 @@ def write_atomically(path: str | Path, write: Callable[[IO[bytes]], object]) -> 
     return path
 
 
+def read_tensors(
+    path: Path, framework: str, expected: str, decode: Callable[[str], Any] = str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The header of a safetensors file, decoded, and its tensors; ``InputError`` when it cannot be read."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework=framework) as file:
+            header = {k: decode(v) for k, v in (file.metadata() or {}).items()}
+            return header, {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
+    except (OSError, ValueError, SafetensorError) as error:
+        text = f"cannot be read ({type(error).__name__}); expected {expected}, whole"
+        raise InputError(f"{path}: {text}") from None
+
+
 def save_demonstrations(path: str | Path, demonstrations: DemonstrationSet) -> Path:
     """Write a demonstration set (checked first, atomically, compressed, without pickle)."""
     arrays, domain = demonstrations.arrays(), demonstrations.domain

@@ -19,6 +19,7 @@ from dmsrd_lite.method.policy_mixture import Mixtures, MixtureSettings, likelies
 
 OUTSIDE = 1.0  # nats above the own second take: who is nearer to mixtures of the others is one of them
 DRAWS, FINALISTS = 5000, 4  # of sets of people
+SEARCH = MixtureSettings(24, 16)  # for the mixture of the others that is nearest to somebody
 TRIALS = 20  # from fresh starts, in which nobody may fail
 
 
@@ -58,13 +59,13 @@ def distances(
 
 
 def draw_in_turn(
-    kinds: list[str], distance: np.ndarray, least: float, n_kept: int, rng: np.random.Generator
+    kinds: list[str], apart: np.ndarray, least: float, n_kept: int, rng: np.random.Generator
 ) -> list[int]:
     """People in a random order in which each is of the kind that is rarest so far, and nobody is too near.
 
-    distance (m, m), nats: nobody is nearer than ``least`` to the others, in either direction.
+    apart (m, m), nats, symmetric: nobody is nearer than ``least`` to the others.
     """
-    apart, kept = np.minimum(distance, distance.T), list[int]()
+    kept = list[int]()
     while len(kept) < n_kept:
         count = Counter(kinds[i] for i in kept)
         near = apart[:, kept].min(1, initial=np.inf)
@@ -86,12 +87,12 @@ def choose_different(
 ) -> list[int]:
     """Of many draws (``draw_in_turn``) the one in which most people are no mixture of the others.
 
-    Asked of the ``FINALISTS`` that are the most even in kinds, and then the farthest apart; ``outside(kept)``
+    distance (m, m), nats: nobody is nearer than ``least`` to the others, in either direction. Asked are the
+    ``FINALISTS`` that are the most even in kinds, and then the farthest apart; ``outside(kept)``
     (len(kept),): nats from mixtures of the others. Fewer than ``n_kept`` where no draw finds so many.
     """
-    rng = np.random.default_rng(seed)
-    drawn = [draw_in_turn(kinds, distance, least, n_kept, rng) for _ in range(DRAWS)]
-    apart = np.where(np.eye(len(kinds), dtype=bool), np.inf, np.minimum(distance, distance.T))
+    rng, apart = np.random.default_rng(seed), _between(np.minimum(distance, distance.T))
+    drawn = [draw_in_turn(kinds, apart, least, n_kept, rng) for _ in range(DRAWS)]
 
     def rank(kept: list[int]) -> tuple:
         counts = sorted(Counter(kinds[i] for i in kept).values(), reverse=True)
@@ -102,69 +103,85 @@ def choose_different(
     return max(whole, key=lambda kept: (outside(kept) >= OUTSIDE).sum()) if whole else finalists[0]
 
 
+def _between(table: np.ndarray) -> np.ndarray:
+    """A table (m, m) without its diagonal, which no minimum shall find."""
+    return np.where(np.eye(len(table), dtype=bool), np.inf, table)
+
+
+def successful(
+    domain: Domain, actor: Actor, shown: DemonstrationSet, good: np.ndarray, seed: int
+) -> tuple[np.ndarray, Actor]:
+    """Who can do the task, indices, and clones of everybody.
+
+    As many ``good`` starts (m, starts) as are shown, no failure in ``TRIALS`` (without ``matched_starts``),
+    and a clone that fails no more often than 1 time in 20.
+    """
+    fails = rollout(domain, actor, TRIALS, [seed, 9]).failed.any(-1).mean(1)
+    clones = clone_demonstrations(shown, [seed, 11], n_steps=2000)[0].actor()
+    clones_fail = rollout(domain, clones, TRIALS, [seed, 12]).failed.any(-1).mean(1)
+    fits = (good.sum(1) >= shown.actions.shape[1]) & (clones_fail - fails <= 0.05)
+    return np.flatnonzero(fits & (domain.comparison.matched_starts | (fails == 0))), clones
+
+
+def _without(clones: Actor, row: int) -> tuple[list[int], Actor]:
+    others = [j for j in range(clones.n_strategies) if j != row]
+    return others, clones.select(others)
+
+
+def pointed_at(clones: Actor, shown: DemonstrationSet, seed: Seed) -> np.ndarray:
+    """KL of each demonstration under the mixture of the others' clones that its actions point at, (n,)."""
+    weights = np.zeros((clones.n_strategies, clones.n_strategies))
+    for row in range(clones.n_strategies):
+        others, known = _without(clones, row)
+        weights[row, others] = likeliest_weights(known, shown.select([row]))
+    return policy_divergences(Mixtures(clones, weights), shown, seed)
+
+
+def searched_for(clones: Actor, shown: DemonstrationSet, seed: list[int]) -> np.ndarray:
+    """The same for the mixture that a search finds: what actions point at need not be the nearest."""
+    each = (
+        (_without(clones, row)[1], shown.select([row]), [*seed, row]) for row in range(clones.n_strategies)
+    )
+    return np.array([search_mixture(known, one, SEARCH, s).divergence for known, one, s in each])
+
+
 def choose_demonstrators(
     domain: Domain, actor: Actor, settings: DiaynSettings, seed: int, n_kept: int, n_trajectories: int = 3
 ) -> tuple[np.ndarray, list[DemonstrationSet], dict]:
     """The most different of the successful policies: their indices, two takes of them, and the choice for the
     metadata.
 
-    Success: ``n_trajectories`` good starts (``good_flights``), no failure in ``TRIALS`` (without
-    ``matched_starts``), and a clone that fails no more often than 1 time in 20. Then ``choose_different``.
-    ``InputError`` when too few are left.
+    ``successful``, then ``choose_different``. ``InputError`` when too few are left.
     """
-    comparison, describe = domain.comparison, diversity_of(domain).describe
     good, takes = good_flights(domain, actor, settings, n_trajectories, seed)
-    fits = good.sum(1) >= n_trajectories
-    fails = rollout(domain, actor, TRIALS, [seed, 9]).failed.any(-1).mean(1)
-    clones = clone_demonstrations(takes[0], [seed, 11], n_steps=2000)[0].actor()
-    clones_fail = rollout(domain, clones, TRIALS, [seed, 12]).failed.any(-1).mean(1)
-    fits &= clones_fail - fails <= 0.05
-    if not comparison.matched_starts:
-        fits &= fails == 0
-    able = np.flatnonzero(fits)
+    able, clones = successful(domain, actor, takes[0], good, seed)
     takes, clones = [take.select(able) for take in takes], clones.select(able)
-    people = [describe(shown) for shown in takes[0].observations]
-    table, floor = (
-        distances(takes, actor.select(able), [seed, 10]) if len(able) else (np.zeros((0, 0)), np.zeros(0))
-    )
-
-    def without(kept: list[int], row: int) -> tuple[list[int], Actor, DemonstrationSet]:
-        others = [j for j in range(len(kept)) if j != row]
-        return others, clones.select([kept[j] for j in others]), takes[0].select([kept[row]])
+    people = [diversity_of(domain).describe(shown) for shown in takes[0].observations]
+    kinds, least = [str(person["kind"]) for person in people], domain.comparison.others_at_least
+    table, floor = np.zeros((0, 0)), np.zeros(0)
+    if len(able):
+        table, floor = distances(takes, actor.select(able), [seed, 10])
 
     def outside(kept: list[int]) -> np.ndarray:
-        weights = np.zeros((len(kept), len(kept)))
-        for row in range(len(kept)):
-            others, known, one = without(kept, row)
-            weights[row, others] = likeliest_weights(known, one)
-        mixtures, shown = Mixtures(clones.select(kept), weights), takes[0].select(kept)
-        return policy_divergences(mixtures, shown, [seed, 13]) - floor[kept]
+        return pointed_at(clones.select(kept), takes[0].select(kept), [seed, 13]) - floor[kept]
 
-    kinds = [str(person["kind"]) for person in people]
-    kept = choose_different(kinds, table, comparison.others_at_least, n_kept, outside, [seed, 15])
+    kept = choose_different(kinds, table, least, n_kept, outside, [seed, 15])
     if len(kept) < n_kept:
         found = ", ".join(f"{n} {kind}" for kind, n in Counter(kinds).items())
         raise InputError(
-            f"only {len(kept)} of {len(fits)} demonstrators of {domain.name} with seed {seed} succeed "
-            f"({found}) and are {comparison.others_at_least} nats apart; expected {n_kept}"
+            f"only {len(kept)} of {len(good)} demonstrators of {domain.name} with seed {seed} succeed "
+            f"({found}) and are {least} nats apart; expected {n_kept}"
         )
-    chosen = table[np.ix_(kept, kept)] + np.where(np.eye(n_kept, dtype=bool), np.inf, 0.0)
-    best = outside(kept)
-    for row in range(n_kept):  # what its actions point at need not be the nearest
-        _, known, one = without(kept, row)
-        found = (
-            search_mixture(known, one, MixtureSettings(24, 16), [seed, 14, row]).divergence - floor[kept[row]]
-        )
-        best[row] = min(best[row], found)
+    searched = searched_for(clones.select(kept), takes[0].select(kept), [seed, 14]) - floor[kept]
     choice = {
-        "trained": len(fits),
+        "trained": len(good),
         "successful": able,
         "kept": able[kept],
         "kind": [kinds[i] for i in kept],
         "people": [people[i] for i in kept],
         "own_divergence": floor[kept],
-        "nearest_other": chosen.min(1),
-        "above_mixtures_of_others": best,
+        "nearest_other": _between(table[np.ix_(kept, kept)]).min(1),
+        "above_mixtures_of_others": np.minimum(outside(kept), searched),
         "good_starts": good[able[kept]].mean(1),
     }
     shown = [replace(take.select(kept), strategy_labels=np.arange(n_kept)) for take in takes]

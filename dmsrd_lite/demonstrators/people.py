@@ -8,7 +8,7 @@ from dmsrd_lite.demonstrations import (
     DATA_FOLDER,
     DemonstrationSet,
     demonstrations_from,
-    load_shipped,
+    read_tensors,
     write_atomically,
 )
 from dmsrd_lite.domains import Domain, InputError
@@ -36,15 +36,8 @@ def load_demonstrators(path: str | Path, domain: Domain, n_people: int = 0) -> t
 
     ``InputError`` when the file is cut short, of another domain or of fewer than ``n_people``.
     """
-    from safetensors import SafetensorError, safe_open
-
     path = Path(path).resolve()
-    try:
-        with safe_open(path, framework="np") as file:
-            header, arrays = file.metadata() or {}, {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
-    except (OSError, ValueError, SafetensorError) as error:
-        expected = "expected demonstrators written by save_demonstrators, whole"
-        raise InputError(f"{path}: cannot be read ({type(error).__name__}); {expected}") from None
+    header, arrays = read_tensors(path, "np", "demonstrators written by save_demonstrators")
     if header.get("format") != _FORMAT:
         raise InputError(f"{path}: is a {header.get('format')!r}; expected {_FORMAT!r}")
     if header["domain"] != domain.name:
@@ -77,9 +70,3 @@ def fresh_takes(
 ) -> DemonstrationSet:
     """The same people once more: ``n_rollouts`` from new starts, or a second take from given ones (M, k)."""
     return demonstrations_from(rollout(domain, actor, n_rollouts, seed, reset_seeds=reset_seeds), actor)
-
-
-def shipped_fresh_takes(domain: Domain, n_rollouts: int, seed: Seed) -> DemonstrationSet:
-    """Fresh takes of everybody in the shipped demonstrations, from new starts; for evaluation only."""
-    n_people = load_shipped(domain).n_demonstrations
-    return fresh_takes(load_shipped_demonstrators(domain, n_people), domain, n_rollouts, seed)

@@ -72,9 +72,6 @@ class Correlations:
     spearman: float  # of ranks: a reward that only says who failed does not get far
     spearman_of_good: float  # among those that never fail; NaN where the test set does not say
 
-    def __str__(self) -> str:
-        return f"{self.pearson:6.3f} {self.spearman:6.3f} {self.spearman_of_good:6.3f}"
-
 
 def reward_correlations(test_set: RewardTestSet, trajectory_rewards: np.ndarray) -> Correlations:
     """The three correlations of any reward, given as mean rewards (n,) of the test set's trajectories."""

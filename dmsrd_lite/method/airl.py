@@ -292,7 +292,8 @@ class AIRL:
             clock.append(time.perf_counter())
             self._remember(self._samples(data, actor, s.replay_samples, seeds[1]))
             loss, accuracy = self._discriminate(seeds[2])
-            self._average(iteration)
+            self._average()
+            self._keep(iteration)
             self._grow(accuracy, iteration)
             clock.append(time.perf_counter())
             if self.learns_policies:
@@ -347,9 +348,8 @@ class AIRL:
 
     def _remember(self, new: Samples) -> None:
         """Into the replay; of all iterations' samples every second is dropped whenever they get too many."""
-        self.replay.append(
-            (new[0][:, :: self.thinning], new[1][:, :: self.thinning], new[2][:, :: self.thinning])
-        )
+        x, x_next, log_pi = (part[:, :: self.thinning] for part in new)
+        self.replay.append((x, x_next, log_pi))
         held = sum(x.shape[1] for x, *_ in self.replay)
         if not self.settings.replay_iterations and held > REPLAY_SIZE:
             self.thinning *= 2
@@ -447,16 +447,19 @@ class AIRL:
         slope = torch.autograd.grad(self.rewards.total(x).sum(), x, create_graph=True)[0].norm(dim=-1)
         return (slope - self.settings.penalty_slope).clamp(min=0).square().mean(1)
 
+    def _keep(self, iteration: int) -> None:
+        """An iterate of the rewards, of which at most ``n_iterates`` are held, evenly spread."""
+        if self.settings.n_iterates and iteration % self.every == 0:
+            self.iterates.append(copy.deepcopy(self.rewards))
+            if len(self.iterates) > self.settings.n_iterates:
+                self.iterates, self.every = self.iterates[::2], 2 * self.every
+
     def mean_of_iterates(self, share: float = 1.0) -> "MeanRewards":
         """The mean of the reward functions over (the first ``share`` of) the iterations so far."""
         return MeanRewards(self.iterates[: max(1, round(share * len(self.iterates)))])
 
     @torch.no_grad()
-    def _average(self, iteration: int = 0) -> None:
-        if self.settings.n_iterates and iteration % self.every == 0:
-            self.iterates.append(copy.deepcopy(self.rewards))
-            if len(self.iterates) > self.settings.n_iterates:
-                self.iterates, self.every = self.iterates[::2], 2 * self.every
+    def _average(self) -> None:
         decay = min(
             self.settings.reward_average, self.n_averaged / (self.n_averaged + 3)
         )  # forgets the start faster

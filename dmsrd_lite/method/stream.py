@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dmsrd_lite.demonstrations import DemonstrationSet, check_folder, plain, write_atomically
+from dmsrd_lite.demonstrations import DemonstrationSet, check_folder, plain, read_tensors, write_atomically
 from dmsrd_lite.domains import Domain, InputError
 from dmsrd_lite.learning.networks import under
 from dmsrd_lite.method.dmsrd import DMSRDSettings, learn
@@ -34,16 +34,8 @@ def save_state(path: str | Path, state: State) -> Path:
 
 def load_state(path: str | Path, domain: Domain) -> State:
     """Read a state; ``InputError`` when it is cut short, of another version or of another domain."""
-    from safetensors import SafetensorError, safe_open
-
     path = Path(path).resolve()
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = {k: json.loads(v) for k, v in (file.metadata() or {}).items()}
-            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
-    except (OSError, ValueError, SafetensorError) as error:
-        expected = "expected a state written by save_state, whole"
-        raise InputError(f"{path}: cannot be read ({type(error).__name__}); {expected}") from None
+    header, tensors = read_tensors(path, "pt", "a state written by save_state", json.loads)
     if (found := (header.get("format"), header.get("version"))) != (_FORMAT, _VERSION):
         expected = f"expected {_FORMAT!r} of version {_VERSION}"
         raise InputError(f"{path}: is a {found[0]!r} of version {found[1]!r}; {expected}")

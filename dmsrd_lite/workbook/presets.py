@@ -68,13 +68,7 @@ _FROM_NOTHING: dict[str, dict[str, Any]] = {
 
 def from_nothing(domain: str, settings: AIRLSettings, **changes: Any) -> Any:
     """``settings`` (of AIRL or MSRD) from nothing: penalty, growing episodes, mean of iterates."""
-    usual = {
-        "start": "nothing",
-        "penalty_weight": 1.0,
-        "n_iterates": 32,
-        "entropy_tuning": 0.1,
-        **_FROM_NOTHING[domain],
-    }
+    usual = {"start": "nothing", "penalty_weight": 1.0, "n_iterates": 32, "entropy_tuning": 0.1}
     return replace(settings, **{**usual, **_FROM_NOTHING[domain], **changes})
 
 
