@@ -43,18 +43,22 @@ def execute(
     """
     import papermill
     from papermill.exceptions import PapermillExecutionError
+    from traitlets.config import Config
 
     limit = math.ceil(cell_seconds or CELL_LIMITS.get(parameters.get("preset", ""), CELL_LIMITS["full"]))
     output.parent.mkdir(parents=True, exist_ok=True)
     start, error = time.perf_counter(), ""
-    options = {
+    options: dict[str, Any] = {
         "kernel_name": "python3",
         "cwd": str(folder),
         "execution_timeout": limit,
         "progress_bar": False,
     }
     try:
-        papermill.execute_notebook(str(path), str(output), parameters, **options)
+        with tempfile.TemporaryDirectory(prefix="dmsrd_lite_") as sockets:
+            if os.name == "posix":  # two kernels that start at once may draw the same TCP port: no ports
+                options["config"] = Config(KernelManager={"transport": "ipc", "ip": f"{sockets}/kernel"})
+            papermill.execute_notebook(str(path), str(output), parameters, **options)
     except PapermillExecutionError as failure:
         error = f"cell {failure.exec_count}: {failure.ename}: {(failure.evalue.splitlines() or [''])[0]}"
     except Exception as failure:  # a dead kernel or a time-out; whatever it is, the other notebooks go on
