@@ -1,6 +1,6 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
-CODE := dmsrd_lite tests notebooks
+CODE := dmsrd_lite tests notebooks papermill_runs/peers
 
 .PHONY: workbook test verify lab lint lock results
 

@@ -67,7 +67,9 @@ def _results(arguments: argparse.Namespace) -> int:
 def _bench(arguments: argparse.Namespace) -> int:
     from dmsrd_lite.workbook.bench import bench
 
-    result = bench(check_whole(arguments.seed, "seed"), check_whole(arguments.iterations, "iterations", 2))
+    n_iterations = check_whole(arguments.iterations, "iterations", 2)
+    n_from_nothing = check_whole(arguments.from_nothing, "from-nothing")
+    result = bench(check_whole(arguments.seed, "seed"), n_iterations, n_from_nothing)
     print(json.dumps(result, indent=None if arguments.json else 1))
     return 0
 
@@ -132,6 +134,7 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--json", action="store_true", help="end with the result as one line of JSON")
     bench.add_argument("--seed", default="0")
     bench.add_argument("--iterations", default="6")
+    bench.add_argument("--from-nothing", default="0", help="iterations from nothing (0: as in the lessons)")
     gallery = command(
         "gallery", _gallery, "take the figures of the gallery out of a folder of executed notebooks"
     )

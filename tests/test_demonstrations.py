@@ -253,7 +253,9 @@ def test_shipped_sets(domain):
     assert len(np.unique(test.snapshot)) == 100
     for some in (test, development):  # from the time of failure and of success
         failing, good = (some.failed[:, -1] == 1).mean(), (some.returns >= domain.success_return).mean()
-        assert (0.2 < failing < 0.75, 0.2 < good < 0.65) == (True, True)
+        between = ((some.returns >= domain.poor_return) & (some.returns < domain.success_return)).mean()
+        between = between if np.isfinite(domain.poor_return) else 1 - failing - good
+        assert (0.2 < failing < 0.8, 0.2 < good < 0.65, between > 0.1) == (True, True, True)
     worst, best = {"inverted_pendulum": (-1400, -20), "lunar_lander": (-500, 250)}[domain.name]
     assert test.returns.min() < worst < best < test.returns.max()
 

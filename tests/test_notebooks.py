@@ -55,7 +55,7 @@ SHIPPED = str(DATA_FOLDER / "inverted_pendulum_demonstrations.npz")
         ("01_demonstrations", {"preset": "huge"}, "unknown preset 'huge'"),
         ("01_demonstrations", {"seed": -1}, "seed -1: expected a whole number"),
         ("01_demonstrations", {"demonstrations_path": "none.npz"}, "there is no such file"),
-        ("02_airl", {"n_demonstrations": 40}, "n_demonstrations 40: expected a whole number from 1 to 10"),
+        ("02_airl", {"person": 40}, "person 40: expected a whole number from 0 to 9"),
         ("03_msrd", {"alpha": -1.0}, "alpha -1.0: expected a number from"),
         ("04_policy_mixture", {"weight": 2.0}, "weight 2.0: expected a number from 0 to 1"),
         ("05_between_class_discrimination", {"n_iterations": -1}, "n_iterations -1: expected a whole number"),

@@ -47,16 +47,19 @@ def generate_test_set(
     """Trajectories of new policies at ``n_snapshots`` moments of a separate training each: as many from the
     time of failure as from half and from full success (``spread_moments``).
 
-    Failure: half of the probes fail; success: they return ``domain.success_return`` in the mean. Writes the
-    arrays of ``RewardTestSet``, ``observations`` in half precision.
+    Failure: half of the probes fail, and they return less than ``domain.poor_return`` in the mean; success:
+    at least ``domain.success_return``. Writes the arrays of ``RewardTestSet``, ``observations`` in half
+    precision.
     """
     path, n = check_folder(path), settings.training.n_strategies
     actors, quality = list[Actor](), []
     for record in progress(train_demonstrators(domain, diversity_of(domain).test_population, settings, seed)):
         actors.append(record["policies"].actor())
         probe = rollout(domain, actors[-1], PROBES, [seed, 8, record["iteration"]])
-        fails, good = probe.failed.any(-1).mean(1) >= 0.5, probe.returns.mean(1) >= domain.success_return
-        quality.append(np.where(fails, 0, 1 + good))
+        fails, returns = probe.failed.any(-1).mean(1) >= 0.5, probe.returns.mean(1)
+        quality.append(
+            np.where(fails & (returns < domain.poor_return), 0, 1 + (returns >= domain.success_return))
+        )
     moments = np.array(
         [spread_moments(of_one, n_snapshots) for of_one in np.transpose(quality)]
     )  # (M, n_snapshots)

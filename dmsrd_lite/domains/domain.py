@@ -115,6 +115,7 @@ class Domain:
     ]  # new states (..., obs_dim), rewards (...) -> bool (...)
     success_return: float  # whoever can do the task reaches at least this
     simulator: Simulator
+    poor_return: float = float("inf")  # who fails and returns less has hardly begun to learn
     comparison: StateComparison = StateComparison()
     exploration: Exploration = Exploration()
     drawing: Drawing | None = None

@@ -121,6 +121,7 @@ INVERTED_PENDULUM = Domain(
     failure_text="falls",
     failed=lambda states, rewards: np.abs(states[..., 1]) > 1.0,
     success_return=-100.0,
+    poor_return=-1400.0,  # who does nothing returns -1550
     simulator=Simulator(PendulumBatch),
     comparison=StateComparison(others_at_least=2.5),
     drawing=Drawing(draw, phase_axes=(0, 2), reward_axes=(1, 0), reward_window=((-1.6, 1.6), (-1.0, 1.0))),

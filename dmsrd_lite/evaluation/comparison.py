@@ -13,11 +13,12 @@ from dmsrd_lite.domains import InputError
 from dmsrd_lite.domains.domain import Seed
 from dmsrd_lite.evaluation.metrics import correlations_on, score_policies
 from dmsrd_lite.learning.networks import GaussianPolicies, under
-from dmsrd_lite.method.airl import AIRL, AIRLSettings, Rewards
+from dmsrd_lite.method.airl import AIRL, AIRLSettings
 from dmsrd_lite.method.between_class_discrimination import recognized
 from dmsrd_lite.method.dmsrd import DMSRDSettings, learn
 from dmsrd_lite.method.msrd import MSRD, MSRDSettings
 from dmsrd_lite.method.policy_mixture import Mixtures
+from dmsrd_lite.method.rewards import MeanRewards, Rewards
 from dmsrd_lite.method.state import State
 
 METHODS = ("cloning", "AIRL Single", "AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD")
@@ -30,14 +31,15 @@ class MethodSettings:
     airl: AIRLSettings = AIRLSettings(n_iterations=25)
     msrd: MSRDSettings = MSRDSettings(n_iterations=25, discriminator_steps=24)
     dmsrd: DMSRDSettings = DMSRDSettings()
-    batch_steps: int = 40  # discriminator updates per iteration of AIRL Batch, one model for all the data
+    batch: AIRLSettings = AIRLSettings(n_iterations=25, discriminator_steps=40)  # one model for all the data
 
     def as_in_the_paper(self) -> "MethodSettings":
         """From nothing without coverage, and AIRL for a new strategy on its own reward alone."""
         off: dict[str, Any] = {"start": "nothing", "coverage": "none"}
         airl, msrd = replace(self.dmsrd.airl, **off), replace(self.dmsrd.msrd, **off)
         loop = replace(self.dmsrd, airl=airl, msrd=msrd, add_task_reward=False)
-        return replace(self, airl=replace(self.airl, **off), msrd=replace(self.msrd, **off), dmsrd=loop)
+        alone = {name: replace(getattr(self, name), **off) for name in ("airl", "msrd", "batch")}
+        return replace(self, dmsrd=loop, **alone)
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Learned:
 
     policies: GaussianPolicies
     weights: np.ndarray
-    rewards: Rewards | None = None
+    rewards: Rewards | MeanRewards | None = None
     task_part: str = "g"  # the part of the rewards that is to know the task
     pure: tuple[
         int, ...
@@ -54,6 +56,9 @@ class Learned:
     steps: int = 0  # environment steps of training, all strategies together
     search_steps: int = 0
     seconds: float = 0.0
+    curve: Sequence[
+        Sequence[float]
+    ] = ()  # by iteration: steps of a strategy so far, true reward per step (M)
 
     def actor(self) -> Mixtures:
         return Mixtures(self.policies.actor(), self.weights)
@@ -85,18 +90,20 @@ def train_method(
     if method == "MSRD":
         learner, part = MSRD(shown, settings.msrd, seed), "task"
     elif method == "AIRL Batch":
-        pooled = replace(settings.airl, discriminator_steps=settings.batch_steps)
-        learner, pure, weights = AIRL(shown.pooled(), pooled, seed), (), np.ones((n, 1))
+        learner, pure, weights = AIRL(shown.pooled(), settings.batch, seed), (), np.ones((n, 1))
     elif method == "AIRL Single":
         learner = AIRL(shown, settings.airl, seed)
     else:
         only_clone = replace(settings.airl, n_iterations=0, coverage="none", start="clone")
         clone = AIRL(shown, only_clone, seed).policies
         return Learned(clone, weights, seconds=time.perf_counter() - start)
-    for _ in progress(learner.train()):
-        pass
+    curve = [
+        [r["steps"], *(r["environment_return"] / r["horizon"]).round(4)] for r in progress(learner.train())
+    ]
     steps, seconds = learner.steps * len(learner.x), time.perf_counter() - start
-    return Learned(learner.policies, weights, learner.averaged_rewards, part, pure, steps, 0, seconds)
+    return Learned(
+        learner.learned_policies, weights, learner.learned_rewards, part, pure, steps, 0, seconds, curve
+    )
 
 
 def learned_by(state: State) -> Learned:
@@ -133,6 +140,7 @@ def score_method(
         "steps": learned.steps,
         "search_steps": learned.search_steps,
         "seconds": learned.seconds,
+        "curve": learned.curve,
     }
 
 
@@ -141,9 +149,14 @@ def restore(
 ) -> Learned:
     """What ``Learned.tensors`` kept, to be scored again; ``alpha`` as trained, 0 without a task reward."""
     m = tensors["weights"].shape[1]
-    policies, rewards = GaussianPolicies(shown.domain, m, 0), Rewards(shown.domain, m, 0.99, 0, alpha)
-    for name, module in (("policy", policies), ("reward", rewards)):
+    policies, found = GaussianPolicies(shown.domain, m, 0), under("reward", tensors)
+    n_iterates = len({name.split(".")[1] for name in found if name.startswith("iterates.")})
+    several = [Rewards(shown.domain, m, 0.99, 0, alpha) for _ in range(n_iterates or 1)]
+    rewards = MeanRewards(several) if n_iterates else several[0]
+    modules: list[tuple[str, torch.nn.Module]] = [("policy", policies), ("reward", rewards)]
+    for name, module in modules:
         kept = {k: torch.tensor(v) for k, v in under(name, tensors).items()}
         module.load_state_dict(kept, strict=False)  # shaping is not kept
-    known = rewards if under("reward", tensors) else None
-    return Learned(policies, tensors["weights"], known, "task" if alpha else "g", tuple(pure))
+    return Learned(
+        policies, tensors["weights"], rewards if found else None, "task" if alpha else "g", tuple(pure)
+    )

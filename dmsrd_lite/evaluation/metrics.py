@@ -10,8 +10,8 @@ from dmsrd_lite.demonstrations import DemonstrationSet, RewardTestSet
 from dmsrd_lite.domains.domain import Seed, extend
 from dmsrd_lite.learning.networks import SIGMA_FLOOR, Policies, one_thread, to_tensor
 from dmsrd_lite.learning.rollouts import rollout
-from dmsrd_lite.method.airl import Rewards
 from dmsrd_lite.method.divergence import demonstration_divergence, policy_divergences
+from dmsrd_lite.method.rewards import MeanRewards, Rewards
 
 
 def demonstration_log_likelihood(actor: Policies, demonstrations: DemonstrationSet) -> np.ndarray:
@@ -94,7 +94,7 @@ def one_line_rewards(test_set: RewardTestSet) -> dict[str, np.ndarray]:
     return found if test_set.failed is None else {"has not failed": 1 - test_set.failed.mean(1), **found}
 
 
-def correlations_on(test_set: RewardTestSet, rewards: Rewards, part: str = "g") -> np.ndarray:
+def correlations_on(test_set: RewardTestSet, rewards: Rewards | MeanRewards, part: str = "g") -> np.ndarray:
     """Correlation of each reward, or a ``part`` of it (``Rewards.evaluate``), with the true return: (M,)."""
     means = rewards.evaluate(test_set.observations, part).mean(2)
     return np.array([reward_correlation(mean, test_set.returns) for mean in means])

@@ -116,6 +116,11 @@ class PolicyOptimizer:
                     loss = loss - cloning_weight * shown.mean(1).sum()
                 self._step(loss)
 
+    def slow_down(self, share: float) -> None:
+        """From here on learn with this share of the settings' rate."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.settings.learning_rate * share
+
     def _step(self, loss: torch.Tensor) -> None:
         self.optimizer.zero_grad()
         loss.backward()
@@ -161,8 +166,7 @@ def anneal(
     if settings.last_discount:
         far, near = 1 - settings.ppo.discount, 1 - settings.last_discount
         optimizer.settings = replace(settings.ppo, discount=1 - far * (near / far) ** share)
-    for group in optimizer.optimizer.param_groups:
-        group["lr"] = settings.ppo.learning_rate * (1 - (1 - settings.last_rate) * share)
+    optimizer.slow_down(1 - (1 - settings.last_rate) * share)
     if settings.last_sigma:
         progress = min(1.0, max(0.0, (share - 0.4) / 0.5))
         with torch.no_grad():

@@ -14,20 +14,13 @@ import numpy as np
 import torch
 
 from dmsrd_lite.demonstrations import DemonstrationSet
-from dmsrd_lite.domains import Domain, InputError
+from dmsrd_lite.domains import InputError
 from dmsrd_lite.domains.domain import Seed, extend
 from dmsrd_lite.learning.cloning import clone_behavior
-from dmsrd_lite.learning.networks import (
-    Actor,
-    BatchedMLP,
-    GaussianPolicies,
-    Policies,
-    one_thread,
-    to_tensor,
-    under,
-)
+from dmsrd_lite.learning.networks import Actor, GaussianPolicies, Policies, one_thread, to_tensor, under
 from dmsrd_lite.learning.policy_optimization import PolicyOptimizer, PPOSettings
 from dmsrd_lite.learning.rollouts import Rollouts, rollout
+from dmsrd_lite.method.rewards import MeanRewards, Rewards
 
 WORDS = {  # of the settings that are words
     "start": ("clone", "nothing"),
@@ -35,6 +28,7 @@ WORDS = {  # of the settings that are words
     "coverage": ("half", "once", "none"),
     "penalty_points": ("between", "samples", "demonstrations"),
 }
+ENTROPY_WEIGHTS = (0.002, 0.1)  # within which c is tuned
 REPLAY_SIZE = 100_000  # samples per strategy that a replay of all iterations holds at most
 Samples = tuple[
     torch.Tensor, torch.Tensor, torch.Tensor
@@ -50,7 +44,9 @@ class AIRLSettings:
     first_sigma: float = 0.2  # of an untrained policy, share of half the action range
     policy_base: str = "g"  # what the policy is paid: "g" as in the paper, or "f" ...
     entropy_weight: float = 0.0  # ... less this weight c times log pi; "f" with c = 1 is log D - log(1 - D)
-    entropy_tuning: float = 0.0  # how fast c follows the demonstrations (``tune_entropy``); 0: c is fixed
+    entropy_tuning: float = (
+        0.0  # how fast c follows the demonstrations (``AIRL.tune_entropy``); 0: c is fixed
+    )
     cloning_weight: float = 1.0  # of the demonstration's negative log-likelihood in a clone's loss
     cloning_steps: int = 2000
     coverage: str = (
@@ -72,95 +68,39 @@ class AIRLSettings:
     replay_iterations: int = 10  # policy samples of so many iterations are kept; 0: of all, thinned
     replay_samples: int = 2000  # per strategy and iteration
     n_iterates: int = 0  # rewards kept for their mean (``mean_of_iterates``), spread over the iterations
+    iterates_share: float = 0.5  # which of them are used: the first ones
     reward_average: float = (
         0.9  # decay of the running average of the reward's weights; 0 keeps the last iterate
     )
+    policy_average: float = 0.0  # decay of the running average of the policies' weights; 0 keeps the last
+    last_rate: float = 1.0  # PPO's learning rate falls to this share of itself over the second half
     ppo: PPOSettings = PPOSettings(learning_rate=1e-4, epochs=1, sample_fraction=0.5)
 
     def __post_init__(self) -> None:
         for name, words in WORDS.items():
             if getattr(self, name) not in words:
                 raise InputError(f"{name} {getattr(self, name)!r}: expected one of {', '.join(words)}")
-        for name in ("penalty_weight", "entropy_weight", "cloning_weight"):
+        for name in ("penalty_weight", "entropy_weight", "entropy_tuning", "cloning_weight"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"{name} {getattr(self, name)!r}: expected a number of at least 0")
+        for name, least in (("policy_average", 0.0), ("last_rate", 0.0), ("iterates_share", 1e-9)):
+            if not least <= getattr(self, name) <= 1:
+                raise InputError(f"{name} {getattr(self, name)!r}: expected a share of at most 1")
         if not self.penalty_slope > 0:
             raise InputError(f"penalty_slope {self.penalty_slope!r}: expected a positive number")
-        if self.growth < 1 or self.first_horizon < 0:
-            text = "expected a growth of at least 1 from a first horizon of at least 0 steps"
+        if self.first_horizon < 0 or self.growth < 1 or (self.first_horizon and self.growth == 1):
+            text = (
+                "expected a growth above 1 from a first horizon of at least 1 step, or 0 for whole episodes"
+            )
             raise InputError(f"growth {self.growth!r} from first_horizon {self.first_horizon!r}: {text}")
 
 
-class Rewards(torch.nn.Module):
-    """Strategy rewards ``g_j(s)``, shaping terms ``h_j(s)`` and, where strategies share one, a task reward.
-
-    ``R_j = g_j``, or ``R_j = R_Task + alpha g_j`` with ``alpha`` > 0 (Equation 1); each network is an MLP
-    (32, 32) of the state. ``R_Task`` starts at zero. Rewards are bounded: unbounded they correlated with the
-    true return as well, but none of ten fresh policies learned to balance on one frozen, with the same
-    training that succeeds on a bounded one. Why is not settled.
-    """
-
-    bound = 5.0  # nats
-
-    def __init__(self, domain: Domain, n_strategies: int, discount: float, seed: Seed, alpha: float = 0.0):
-        super().__init__()
-        self.domain, self.discount, self.alpha = domain, discount, alpha
-        sizes = (domain.obs_dim, 32, 32, 1)
-        self.strategy_reward = BatchedMLP(
-            n_strategies, sizes, extend(seed, 0), last_gain=0.1 if alpha else 1.0
-        )
-        self.shaping = BatchedMLP(n_strategies, sizes, extend(seed, 1))
-        if alpha:
-            self.task_reward = BatchedMLP(1, sizes, extend(seed, 2), last_gain=0.0)
-
-    def g(self, x: torch.Tensor) -> torch.Tensor:
-        """``g_j(s) = b tanh(net_j(s) / b)``: network inputs (M, n, obs_dim) -> (M, n), within the bound b."""
-        return self.bound * torch.tanh(self.strategy_reward(x)[..., 0] / self.bound)
-
-    def task(self, x: torch.Tensor) -> torch.Tensor:
-        """``R_Task(s)``, bounded as ``g`` is: (M, n, obs_dim) -> (M, n), one network for all M."""
-        return self.bound * torch.tanh(
-            self.task_reward(x.reshape(1, -1, x.shape[-1])).view(x.shape[:2]) / self.bound
-        )
-
-    def total(self, x: torch.Tensor) -> torch.Tensor:
-        """``R_j(s) = R_Task(s) + alpha g_j(s)``, or ``g_j(s)`` where nothing is shared: (M, n)."""
-        return self.task(x) + self.alpha * self.g(x) if self.alpha else self.g(x)
-
-    def f(self, x: torch.Tensor, x_next: torch.Tensor) -> torch.Tensor:
-        """``R_j(s) + gamma h_j(s') - h_j(s)``, (M, n)."""
-        after, before = self.shaping(torch.cat([x_next, x], 1))[..., 0].chunk(2, 1)
-        return self.total(x) + self.discount * after - before
-
-    @one_thread()
-    @torch.no_grad()
-    def evaluate(self, observations: np.ndarray, part: str = "g") -> np.ndarray:
-        """``g``, ``task`` or ``total`` at raw observations (..., obs_dim): (M, ...); the task (1, ...)."""
-        x = to_tensor(self.domain.network_input(observations)).view(1, -1, self.domain.obs_dim)
-        m = 1 if part == "task" else self.strategy_reward.n_strategies
-        values = [
-            getattr(self, part)(some.expand(m, -1, -1)) for some in x.split(100_000, dim=1)
-        ]  # bounded memory
-        return torch.cat(values, 1).numpy().reshape(m, *observations.shape[:-1])
-
-    def mean_rewards(self, demonstrations: DemonstrationSet) -> np.ndarray:
-        """``eta_S-j(tau_i)``, the mean of g_j over the states of demonstration i: (M, n)."""
-        return self.evaluate(demonstrations.observations).mean((2, 3))
-
-
-class MeanRewards:
-    """The mean of several reward functions, not of their weights: what teaches fresh policies (lesson 02)."""
-
-    def __init__(self, iterates: Sequence[Rewards]):
-        self.iterates, self.domain = iterates, iterates[0].domain
-
-    def evaluate(self, observations: np.ndarray, part: str = "g") -> np.ndarray:
-        """As ``Rewards.evaluate``."""
-        return np.mean([rewards.evaluate(observations, part) for rewards in self.iterates], 0)
-
-    def mean_rewards(self, demonstrations: DemonstrationSet) -> np.ndarray:
-        """As ``Rewards.mean_rewards``."""
-        return self.evaluate(demonstrations.observations).mean((2, 3))
+@torch.no_grad()
+def _follow(mean: torch.nn.Module, now: torch.nn.Module, decay: float) -> None:
+    """The running average of what is learned: ``mean <- decay mean + (1 - decay) now``."""
+    for average, parameter in zip(mean.parameters(), now.parameters(), strict=True):
+        if parameter.requires_grad:
+            average.mul_(decay).add_(parameter, alpha=1 - decay)
 
 
 def discriminator_loss(demonstration_logits: torch.Tensor, sample_logits: torch.Tensor) -> torch.Tensor:
@@ -195,8 +135,9 @@ class AIRL:
     From a clone it is the fast way. From nothing, as in the paper, it needs the gradient penalty and episodes
     that grow, or the discriminator is always right and nobody learns (lesson 02).
 
-    After training: ``policies`` (GaussianPolicies), ``rewards`` (the last iterate), ``averaged_rewards`` (the
-    running average, to be used), ``clone`` (Actor of behavioural cloning), ``steps`` per strategy so far.
+    After training: ``learned_policies`` and ``learned_rewards`` (means over iterations, where the settings
+    ask for them), ``policies`` and ``rewards`` (the last iterates), ``clone`` (Actor of behavioural cloning),
+    ``steps`` per strategy so far.
     ``networks``: those of an earlier learner (``networks()``) instead of a clone to start from. ``shared``:
     the rewards of an earlier learner, whose task reward is added to what is learned here, frozen.
     """
@@ -223,7 +164,10 @@ class AIRL:
         self.actions = to_tensor(actions)
         m, k = demonstrations.n_demonstrations, demonstrations.observations.shape[1]
         self.time = np.tile(np.arange(states.shape[1] // k), k)  # of each shown state within its trajectory
-        self.length = float(min(settings.first_horizon or self.horizon, self.horizon))  # of an episode now
+        if settings.first_horizon > self.horizon:
+            text = f"expected at most the demonstrations' {self.horizon} steps to grow to"
+            raise InputError(f"first_horizon {settings.first_horizon}: {text}")
+        self.length = float(settings.first_horizon or self.horizon)  # of an episode now
         self.alpha = self.alpha if shared is None else shared.alpha
         self.policies = GaussianPolicies(self.domain, m, [*seed, 0], settings.first_sigma)
         self.rewards, self.averaged_rewards = (
@@ -247,6 +191,7 @@ class AIRL:
                 demonstrations, seed, settings.cloning_steps
             )
             self.clone = self.policies.actor()
+        self.averaged_policies = copy.deepcopy(self.policies)
         self.optimizer = PolicyOptimizer(
             self.policies, replace(settings.ppo, discount=settings.discount), [*seed, 3]
         )
@@ -273,7 +218,7 @@ class AIRL:
     def train(self, progress: Callable = iter) -> Iterator[dict]:
         """Run the iterations that are left; ``progress`` wraps the range (``tqdm`` for a bar).
 
-        record: iteration; horizon of its episodes; steps (per strategy, coverage included);
+        record: iteration; horizon and number of its episodes; steps (per strategy, coverage included);
         discriminator_loss, accuracy, environment_return and sigma (M,) each - the return is for reading only
         and trains nothing; seconds by part.
         """
@@ -291,20 +236,31 @@ class AIRL:
             self.steps += data.n_steps // len(self.x)
             clock.append(time.perf_counter())
             self._remember(self._samples(data, actor, s.replay_samples, seeds[1]))
-            loss, accuracy = self._discriminate(seeds[2])
+            log_pi = self._log_densities()
+            loss, accuracy = self._discriminate(seeds[2], log_pi)
             self._average()
             self._keep(iteration)
             self._grow(accuracy, iteration)
             clock.append(time.perf_counter())
             if self.learns_policies:
                 shown, weight = (self.x, self.actions), s.cloning_weight if s.start == "clone" else 0.0
+                if s.entropy_tuning:
+                    flown = data.observations[:, :, :-1], data.executed_actions
+                    states, acted = (part.reshape(len(self.x), -1, part.shape[-1]) for part in flown)
+                    own = actor.log_density(states, acted)
+                    self.tune_entropy(log_pi[:, self._near()].mean(1).numpy(), own.mean(1))
+                self.optimizer.slow_down(1 - (1 - s.last_rate) * max(0.0, 2 * iteration / s.n_iterations - 1))
                 paid = self.policy_rewards(data)
                 self.optimizer.update(data, paid, seeds[3], demonstrations=shown, cloning_weight=weight)
+                if s.policy_average:
+                    decay = min(s.policy_average, iteration / (iteration + 3))
+                    _follow(self.averaged_policies, self.policies, decay)
             clock.append(time.perf_counter())
             self.iteration = iteration + 1  # a reader may stop here and call ``train`` again
             yield {
                 "iteration": iteration,
                 "horizon": horizon,
+                "episodes": episodes,
                 "steps": self.steps,
                 "discriminator_loss": loss,
                 "accuracy": accuracy,
@@ -315,36 +271,39 @@ class AIRL:
             }
 
     @one_thread()
+    @torch.no_grad()
     def policy_rewards(self, data: Rollouts) -> np.ndarray:
         """What the policy is paid: ``R_j(s')`` of the state reached, or f, less ``c log pi``; (M, E, T)."""
         m, e, t = data.rewards.shape
         x = to_tensor(self.domain.network_input(data.observations)).view(m, e, t + 1, -1)
         before, after = (part.reshape(m, e * t, -1) for part in (x[:, :, :-1], x[:, :, 1:]))
-        with torch.no_grad():
-            paid = (
-                self.rewards.total(after)
-                if self.settings.policy_base == "g"
-                else self.rewards.f(before, after)
+        of_state = self.settings.policy_base == "g"
+        paid = self.rewards.total(after) if of_state else self.rewards.f(before, after)
+        if self.settings.entropy_weight:
+            actions = to_tensor(data.executed_actions).view(m, e * t, -1)
+            paid = paid - to_tensor(self.entropy_weights)[:, None] * self.policies.log_density(
+                before, actions
             )
-            if self.settings.entropy_weight:
-                actions = to_tensor(data.executed_actions).view(m, e * t, -1)
-                log_pi = self.policies.log_density(before, actions)
-                self.tune_entropy(log_pi.mean(1).numpy())
-                paid = paid - to_tensor(self.entropy_weights)[:, None] * log_pi
-            return paid.view(m, e, t).numpy()
+        return paid.view(m, e, t).numpy()
 
+    @one_thread()
     @torch.no_grad()
-    def tune_entropy(self, own: np.ndarray) -> None:
-        """``c <- c exp(-rate (E_demo[log pi] - E_pi[log pi]))`` within 0.002 and 0.1; ``own`` (M,) is E_pi.
+    def _log_densities(self) -> torch.Tensor:
+        """``log pi_j`` of every demonstrated action under the current policies, (M, n)."""
+        return self.policies.log_density(self.x, self.actions)
 
-        The two are equal where sigma is that of the demonstrated actions around the policy's mean: a policy
-        that is wider finds what was shown likelier than what it does, and c falls.
+    def _near(self) -> np.ndarray:
+        """Which demonstrated steps an episode of the present length can reach."""
+        return np.flatnonzero(self.time < int(self.length))
+
+    def tune_entropy(self, shown: np.ndarray, own: np.ndarray) -> None:
+        """``c <- c exp(-rate (E_demo[log pi] - E_pi[log pi]))`` within 0.002 and 0.1; the two (M,) given.
+
+        They are equal where sigma is that of the demonstrated actions around the policy's mean: a policy that
+        is wider finds what was shown likelier than what it does, and c falls.
         """
-        if self.settings.entropy_tuning:
-            near = np.flatnonzero(self.time < int(self.length))
-            shown = self.policies.log_density(self.x[:, near], self.actions[:, near]).mean(1).numpy()
-            change = np.exp(-self.settings.entropy_tuning * np.clip(shown - own, -1, 1))
-            self.entropy_weights = np.clip(self.entropy_weights * change, 0.002, 0.1)
+        change = np.exp(-self.settings.entropy_tuning * np.clip(shown - own, -1, 1))
+        self.entropy_weights = np.clip(self.entropy_weights * change, *ENTROPY_WEIGHTS)
 
     def _remember(self, new: Samples) -> None:
         """Into the replay; of all iterations' samples every second is dropped whenever they get too many."""
@@ -397,15 +356,12 @@ class AIRL:
         return x, x_next, log_pi
 
     @one_thread()
-    def _discriminate(self, seed: Seed) -> tuple[np.ndarray, np.ndarray]:
-        """Cross-entropy steps on demonstrations against samples: loss and accuracy (M,) of the last one."""
+    def _discriminate(self, seed: Seed, log_pi: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Cross-entropy steps on demonstrations (``log_pi``: of their actions, (M, n)) against samples: loss
+        and accuracy (M,) of the last one."""
         s, rng = self.settings, np.random.default_rng(seed)
-        with torch.no_grad():
-            log_pi = self.policies.log_density(
-                self.x, self.actions
-            )  # of the demonstrations, under the current policy
         pools = [self._joined(list(self.replay)), *([self._joined(self.coverage)] if self.coverage else [])]
-        near = np.flatnonzero(self.time < int(self.length))  # what an episode of this length can reach
+        near = self._near()
         for _ in range(s.discriminator_steps):
             pick = torch.from_numpy(near[rng.integers(0, len(near), s.discriminator_batch)])
             drawn = [[part[:, pick] for part in (self.x, self.x_next, log_pi)]]
@@ -454,16 +410,23 @@ class AIRL:
             if len(self.iterates) > self.settings.n_iterates:
                 self.iterates, self.every = self.iterates[::2], 2 * self.every
 
-    def mean_of_iterates(self, share: float = 1.0) -> "MeanRewards":
+    def mean_of_iterates(self, share: float = 1.0) -> MeanRewards:
         """The mean of the reward functions over (the first ``share`` of) the iterations so far."""
         return MeanRewards(self.iterates[: max(1, round(share * len(self.iterates)))])
 
-    @torch.no_grad()
+    @property
+    def learned_policies(self) -> GaussianPolicies:
+        """What is to be used: the running average of the policies, or the last ones."""
+        return self.averaged_policies if self.settings.policy_average else self.policies
+
+    @property
+    def learned_rewards(self) -> Rewards | MeanRewards:
+        """What is to be used: the mean of iterates where some are kept, else the running average."""
+        return self.mean_of_iterates(self.settings.iterates_share) if self.iterates else self.averaged_rewards
+
     def _average(self) -> None:
         decay = min(
             self.settings.reward_average, self.n_averaged / (self.n_averaged + 3)
         )  # forgets the start faster
-        for mean, now in zip(self.averaged_rewards.parameters(), self.rewards.parameters(), strict=True):
-            if now.requires_grad:
-                mean.mul_(decay).add_(now, alpha=1 - decay)
+        _follow(self.averaged_rewards, self.rewards, decay)
         self.n_averaged += 1

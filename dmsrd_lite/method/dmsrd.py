@@ -9,11 +9,12 @@ import numpy as np
 
 from dmsrd_lite.demonstrations import DemonstrationSet, plain
 from dmsrd_lite.domains import InputError
-from dmsrd_lite.method.airl import AIRL, AIRLSettings, Rewards
+from dmsrd_lite.method.airl import AIRL, AIRLSettings
 from dmsrd_lite.method.divergence import policy_divergences
 from dmsrd_lite.method.kl_threshold import calibrate_threshold
 from dmsrd_lite.method.msrd import MSRDSettings
 from dmsrd_lite.method.policy_mixture import MixtureSettings, search_mixture
+from dmsrd_lite.method.rewards import Rewards
 from dmsrd_lite.method.rounds import play_round
 from dmsrd_lite.method.state import State
 

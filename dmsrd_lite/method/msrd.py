@@ -87,7 +87,7 @@ class MSRD(AIRL):
         self.rewards.task_reward.requires_grad_(False)
         update, most = 0, self.settings.between_class_extra if self.between is not None and self.replay else 0
         while update < most and not self.recognized().all():
-            self._discriminate([*self.seed, 20, update])
+            self._discriminate([*self.seed, 20, update], self._log_densities())
             self._average()
             update += 1
         self.rewards.task_reward.requires_grad_(True)

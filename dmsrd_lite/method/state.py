@@ -11,10 +11,10 @@ from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.domains import Domain, InputError
 from dmsrd_lite.domains.domain import Seed
 from dmsrd_lite.learning.networks import GaussianPolicies, under
-from dmsrd_lite.method.airl import Rewards
 from dmsrd_lite.method.between_class_discrimination import recognized
 from dmsrd_lite.method.divergence import policy_divergences
 from dmsrd_lite.method.policy_mixture import Mixtures
+from dmsrd_lite.method.rewards import Rewards
 
 Module = TypeVar("Module", bound=torch.nn.Module)
 

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -44,7 +45,43 @@ def worker_speedup(seed: int, n_repeats: int = 3) -> dict[str, float]:
     return {"one_process": round(one), "two_processes": round(two), "ratio": round(two / one, 2)}
 
 
-def bench(seed: int = 0, n_iterations: int = 6) -> dict:
+def from_nothing(people: Sequence[int], seed: int, n_iterations: int = 0) -> dict[str, float | None]:
+    """AIRL Single from nothing on the pendulum: speed with every update, and the time to balance.
+
+    Every fifth iteration 20 rollouts of each policy are tried; who falls in none of them at three such checks
+    in a row balances. The checks are not in the seconds or steps (of one person). None: not everybody
+    balanced within the iterations (``n_iterations``, 0: as in the lessons). Ratio: to the simulator, timed at
+    the same number of environments after every fifth iteration.
+    """
+    domain, shown = INVERTED_PENDULUM, load_shipped(INVERTED_PENDULUM).select(people)
+    settings = presets.METHODS_FROM_NOTHING[domain.name].airl
+    settings = dataclasses.replace(settings, n_iterations=n_iterations or settings.n_iterations)
+    learner, seconds, raw_seconds, in_a_row = AIRL(shown, settings, seed), 0.0, 0.0, np.zeros(len(people))
+    balances, to_balance, before = np.zeros(len(people), dtype=bool), None, 0
+    for record in learner.train():
+        seconds += sum(record["seconds"].values())
+        if record["iteration"] % 5 == 4 or record["iteration"] == settings.n_iterations - 1:
+            n_steps, before = (record["steps"] - before) * len(people), record["steps"]
+            n_environments = len(people) * record["episodes"]
+            raw = max(simulator_speed(shown, n_environments, n) for n in (1, 2, os.cpu_count() or 1))
+            raw_seconds += n_steps / raw
+            trial = rollout(domain, learner.policies.actor(), 20, [seed, 97, record["iteration"]])
+            in_a_row = np.where(trial.failed.any((1, 2)), 0, in_a_row + 1)
+            balances |= in_a_row >= 3
+            if balances.all() and to_balance is None:
+                to_balance = round(seconds, 1), record["steps"]
+                break
+    return {
+        "steps_per_s": round(learner.steps * len(people) / seconds),
+        "ratio": round(raw_seconds / seconds, 3),
+        "balance": int(balances.sum()),
+        "seconds_to_balance": to_balance and to_balance[0],
+        "steps_to_balance": to_balance and to_balance[1],
+        "seconds": round(seconds, 1),
+    }
+
+
+def bench(seed: int = 0, n_iterations: int = 6, n_from_nothing: int = 0) -> dict:
     """AIRL on the shipped pendulum demonstrations with the settings of ``full``: steps per second with every
     update included.
 
@@ -80,5 +117,9 @@ def bench(seed: int = 0, n_iterations: int = 6) -> dict:
         "simulator_by_threads": {str(n): round(float(np.median(m))) for n, m in speeds.items()},
         "start_up_seconds": round(start_up, 2),
         "lander": worker_speedup(seed),
+        "from_nothing": {
+            name: from_nothing(people, seed, n_from_nothing)
+            for name, people in {"one": [1], "ten": range(len(shown.actions))}.items()
+        },
         "settings": {**dataclasses.asdict(settings), "n_environments": n_environments, "seed": seed},
     }

@@ -55,20 +55,35 @@ QUICK_MIXTURE = MixtureSettings(24, 16, n_finalists=5)
 # AIRL and MSRD from nothing: what makes them learn stands in lesson 02.
 _FROM_NOTHING: dict[str, dict[str, Any]] = {
     PENDULUM: {
-        "n_iterations": 125, "discriminator_rate": 1e-3, "coverage": "none", "first_horizon": 30,
-        "entropy_weight": 0.05, "ppo": PPOSettings(epochs=4),
+        "n_iterations": 180, "discriminator_rate": 1e-3, "coverage": "none", "first_horizon": 30,
+        "last_rate": 0.1, "ppo": PPOSettings(epochs=4),
     },
     LANDER: {
-        "n_iterations": 100, "episodes": 10, "entropy_weight": 0.05, "first_sigma": 0.5,
-        "coverage": "once", "replay_iterations": 0,
-        "coverage_levels": ((1.0, 0.5), (1.0, 1.0), (1.0, 2.0)), "ppo": PPOSettings(epochs=4, minibatch=500),
+        "n_iterations": 100, "episodes": 8, "first_sigma": 0.5, "coverage": "once", "replay_iterations": 0,
+        "coverage_levels": ((1.0, 0.5), (1.0, 1.0), (1.0, 2.0)), "policy_average": 0.8,
+        "ppo": PPOSettings(epochs=4, minibatch=500),
+    },
+}  # fmt: skip
+_LIVE: dict[str, dict[str, Any]] = {PENDULUM: {"n_iterations": 100}, LANDER: {"episodes": 10}}
+_MSRD_FROM_NOTHING: dict[str, dict[str, Any]] = {
+    PENDULUM: {"n_iterations": 135},
+    LANDER: {"n_iterations": 160, "episodes": 6},
+}
+_BATCH_FROM_NOTHING: dict[str, dict[str, Any]] = {
+    PENDULUM: {"n_iterations": 140, "discriminator_steps": 36, "last_rate": 1.0},
+    LANDER: {
+        "n_iterations": 130, "episodes": 16, "discriminator_steps": 36,
+        "entropy_weight": 0.0, "entropy_tuning": 0.0,  # no c suits one policy for ten people
     },
 }  # fmt: skip
 
 
 def from_nothing(domain: str, settings: AIRLSettings, **changes: Any) -> Any:
     """``settings`` (of AIRL or MSRD) from nothing: penalty, growing episodes, mean of iterates."""
-    usual = {"start": "nothing", "penalty_weight": 1.0, "n_iterates": 32, "entropy_tuning": 0.1}
+    usual: dict[str, Any] = {
+        "start": "nothing", "penalty_weight": 1.0, "entropy_weight": 0.05, "entropy_tuning": 0.1,
+        "policy_average": 0.95, "n_iterates": 16,
+    }  # fmt: skip
     return replace(settings, **{**usual, **_FROM_NOTHING[domain], **changes})
 
 
@@ -78,9 +93,18 @@ METHODS = {
     PENDULUM: MethodSettings(dmsrd=DMSRDSettings(mixture=MIXTURE[PENDULUM])),
     LANDER: MethodSettings(
         msrd=MSRDSettings(n_iterations=25, discriminator_steps=10),
-        batch_steps=10,
+        batch=AIRLSettings(n_iterations=25, discriminator_steps=10),
         dmsrd=DMSRDSettings(kl_margin=1.0, msrd=_LANDER_ROUND, mixture=MIXTURE[LANDER]),
     ),
+}
+METHODS_FROM_NOTHING = {
+    name: replace(
+        usual,
+        airl=from_nothing(name, AIRLSettings()),
+        msrd=from_nothing(name, MSRDSettings(), **_MSRD_FROM_NOTHING[name]),
+        batch=from_nothing(name, AIRLSettings(), **_BATCH_FROM_NOTHING[name]),
+    )
+    for name, usual in METHODS.items()
 }
 
 
@@ -99,50 +123,49 @@ class Demonstrations:  # 01
 @dataclass(frozen=True)
 class AIRLLesson:  # 02
     domain: str
-    n_demonstrations: int
-    nothing_iterations: int
-    n_frames: int  # of the video
-    airl: AIRLSettings
+    live: AIRLSettings  # of the training that the reader watches
     fresh: TrainingSettings  # policies on the frozen reward
+    n_frames: int
+    fit_steps: int  # of the reward fitted to true returns
+    few: tuple[int, ...]  # people on whom ingredients are taken away
+    person: int = 1
 
     @property
-    def batch(self) -> AIRLSettings:
-        """One model learns from everybody's data."""
-        return replace(self.airl, discriminator_steps=40)
+    def methods(self) -> dict[str, MethodSettings]:
+        """By start."""
+        return {"clone": METHODS[self.domain], "nothing": METHODS_FROM_NOTHING[self.domain]}
 
     @property
-    def without_coverage(self) -> AIRLSettings:
-        return replace(self.batch, coverage="none")
-
-    @property
-    def nothing(self) -> AIRLSettings:
-        """One user, from nothing."""
-        return from_nothing(self.domain, AIRLSettings(), n_iterations=self.nothing_iterations)
-
-    @property
-    def broken_name(self) -> str:
-        return "whole episodes" if self.nothing.first_horizon else "no penalty"
-
-    @property
-    def broken(self) -> AIRLSettings:
-        """Without what matters most: growing episodes, or where they are whole anyway, the penalty."""
-        change = {"first_horizon": 0} if self.nothing.first_horizon else {"penalty_weight": 0.0}
-        return replace(self.nothing, n_iterations=20, **change)
-
-    @property
-    def paid(self) -> dict[str, AIRLSettings]:
-        """What the policy is paid, without the cloning term."""
-        paid = {"g": ("g", 0.0), "f - log pi": ("f", 1.0)}
-        return {
-            name: replace(self.airl, policy_base=base, entropy_weight=c, cloning_weight=0.0)
-            for name, (base, c) in paid.items()
+    def variants(self) -> dict[str, AIRLSettings]:
+        """From nothing, each time without one thing; and other pay."""
+        usual = from_nothing(self.domain, AIRLSettings(), n_iterations=self.live.n_iterations)
+        without: dict[str, dict[str, Any]] = {"no penalty": {"penalty_weight": 0.0}}
+        if usual.first_horizon:
+            without["whole episodes"] = {"first_horizon": 0}
+        else:
+            without["no drifting rollouts"] = {"coverage": "none"}
+        paid: dict[str, dict[str, Any]] = {
+            "paid g": {"entropy_weight": 0.0, "entropy_tuning": 0.0},
+            "paid g - 0.05 log pi": {"entropy_tuning": 0.0},
+            "paid f - log pi": {"policy_base": "f", "entropy_weight": 1.0, "entropy_tuning": 0.0},
         }
+        changes: dict[str, dict[str, Any]] = {"as it is": {}, **without, **paid}
+        return {name: replace(usual, **change) for name, change in changes.items()}
 
 
 @dataclass(frozen=True)
 class MSRDLesson:  # 03
-    users: tuple[int, ...]
+    domain: str
+    users: tuple[int, ...]  # of the live training
     msrd: MSRDSettings
+    fresh: TrainingSettings  # policies on the frozen task reward
+
+    @property
+    def methods(self) -> dict[str, MethodSettings]:
+        """By start; with the lesson's alpha."""
+        both = {"clone": METHODS[self.domain], "nothing": METHODS_FROM_NOTHING[self.domain]}
+        alpha = self.msrd.alpha
+        return {start: replace(m, msrd=replace(m.msrd, alpha=alpha)) for start, m in both.items()}
 
     @property
     def alphas(self) -> dict[float, MSRDSettings]:
@@ -238,16 +261,15 @@ def _dmsrd(domain: str, quick: bool) -> DMSRDLesson:
     return DMSRDLesson((0, 1, 2), ((0.5, 0.5, 0.0), (0.3, 0.0, 0.7)), (), replace(methods, dmsrd=loop), fresh)
 
 
+def _fresh(domain: str) -> TrainingSettings:
+    n = 10 if domain == PENDULUM else 5
+    return replace(TRAINING[domain], n_strategies=n, n_iterations=120, hold=0.5, growing=0.9)
+
+
 def _airl(domain: str, quick: bool) -> AIRLLesson:
-    fresh = replace(TRAINING[domain], n_strategies=10, n_iterations=120, hold=0.5, growing=0.9)
-    if not quick:
-        return AIRLLesson(domain, 10, 125 if domain == PENDULUM else 200, 500, AIRLSettings(), fresh)
-    fresh = replace(
-        fresh, n_strategies=5, n_iterations=8, episodes=2, first_horizon=100, growing=1e9
-    )  # short episodes
-    return AIRLLesson(
-        domain, 3, 100, 200, AIRLSettings(n_iterations=6, episodes=4, cloning_steps=1000), fresh
-    )
+    live = from_nothing(domain, AIRLSettings(), **_LIVE[domain])
+    few = (0, 1, 3) if domain == PENDULUM else (1,)
+    return AIRLLesson(domain, live, _fresh(domain), 200 if quick else 500, 2000, few)
 
 
 def _users(quick: bool) -> tuple[int, ...]:
@@ -265,8 +287,8 @@ LESSONS: dict[str, Any] = {  # (domain, quick) -> settings
         300 if quick else 1000, 200 if quick else 2000,
         DiaynSettings(training=replace(_SHORT, n_iterations=40 if quick else 120))),
     "02_airl": _airl,
-    "03_msrd": lambda domain, quick: MSRDLesson(_users(quick), MSRDSettings(
-        n_iterations=9 if quick else 25, discriminator_steps=24, **_small(quick, 8))),
+    "03_msrd": lambda domain, quick: MSRDLesson(domain, (0, 1, 2), MSRDSettings(
+        n_iterations=9 if quick else 25, discriminator_steps=24, **_small(quick, 8)), _fresh(domain)),
     "04_policy_mixture": lambda domain, quick: MixtureLesson(
         (4, 8) if domain == PENDULUM else (0, 1), 0.5, QUICK_MIXTURE if quick else MIXTURE[domain]),
     "05_between_class_discrimination": lambda domain, quick: DiscriminationLesson(
@@ -288,8 +310,7 @@ class Knob(NamedTuple):
 
 KNOBS: dict[str, dict[str, Knob]] = {
     "01_demonstrations": {"n_iterations": Knob("diayn.training.n_iterations", 1, 10_000)},
-    "02_airl": {"n_demonstrations": Knob("n_demonstrations", 1, 10),
-                "n_iterations": Knob("airl.n_iterations", 1, 10_000)},
+    "02_airl": {"person": Knob("person", 0, 9, 1), "n_iterations": Knob("live.n_iterations", 1, 10_000)},
     "03_msrd": {"alpha": Knob("msrd.alpha", 1e-6, 1000, 0.3),
                 "n_iterations": Knob("msrd.n_iterations", 1, 10_000)},
     "04_policy_mixture": {"weight": Knob("share", 0, 1, 0.5)},
@@ -317,7 +338,7 @@ def choose(lesson: str, domain: str, preset: str, **parameters: Any) -> Any:
     settings = LESSONS[lesson](domain, check_preset(preset) == "quick")
     for name, value in parameters.items():
         knob = KNOBS[lesson][name]
-        if value != knob.default:
+        if value != knob.default or isinstance(value, bool) != isinstance(knob.default, bool):
             settings = _put(settings, name, knob, knob.path.split("."), value)
     return settings
 

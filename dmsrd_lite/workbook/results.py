@@ -8,21 +8,24 @@ import numpy as np
 import pandas as pd
 
 from dmsrd_lite.demonstrations import write_atomically
-from dmsrd_lite.domains import DOMAINS
+from dmsrd_lite.domains import DOMAINS, Domain
+from dmsrd_lite.evaluation.worth import solves
 from dmsrd_lite.workbook.lessons import lessons
 from dmsrd_lite.workbook.records import RECORDS, ROOT, load_record
 
 README = ROOT / "papermill_runs" / "README.md"
 BEGIN, END = "<!-- parameters: made by python -m dmsrd_lite results -->", "<!-- end of parameters -->"
 SHOWN = {
+    "able": "do the task (share)",
+    "environment_return": "return",
     "divergence_above_floor": "KL above the floor (nats)",
     "log_likelihood_above_own": "log-likelihood above the demonstrator's own (nats per step)",
-    "environment_return": "return",
-    "failure_share": "failures",
-    "task_correlation": "correlation of the task reward",
-    "recognized": "recognised",
+    "sigma": "sigma",
+    "pearson": "Pearson",
+    "spearman": "Spearman",
+    "spearman_of_good": "Spearman among those that do not fail",
+    "steps": "steps in all",
 }
-SINGLE = ("fresh_solved", "fresh_spared", "every_step", "weight_error", "peak_gb", "environment_steps")
 COLUMNS = ("record", "lesson", "domain", "seed", "method", "metric", "value")
 
 
@@ -43,66 +46,56 @@ def numbers() -> Iterator[tuple]:
     stems = {path.stem[:2]: path.stem for path in lessons()}
     for path in sorted(RECORDS.glob("*.json")):
         (record, _), stem = load_record(path.stem), path.stem
-        domain, seed = record["parameters"]["domain"], record["parameters"]["seed"]
-        for method, metric, value in _numbers(record["results"], DOMAINS[domain].horizon):
+        name, seed = record["parameters"]["domain"], record["parameters"]["seed"]
+        for method, metric, value in _numbers(record, DOMAINS[name]):
             if value is not None:
-                yield stem, stems[stem[:2]], domain, seed, method, metric, float(np.mean(value))
+                yield stem, stems[stem[:2]], name, seed, method, metric, float(np.mean(value))
 
 
-def _numbers(r: dict, horizon: int) -> Iterator[tuple[str, str, Any]]:
+def _numbers(record: dict, domain: Domain) -> Iterator[tuple[str, str, Any]]:
     """Method, metric, and value or values, of a record's results."""
-    strategies = pure if isinstance(pure := r.get("pure", {}), dict) else {"DMSRD": pure}
-    yield "demonstrator", "divergence", r["floor"]
-    yield "demonstrator", "log_likelihood_per_step", r["own_log_likelihood"]
-    for method, scores in _scores(r).items():
-        yield from ((method, metric, value) for metric, value in scores.items())
-        yield method, "divergence_above_floor", np.subtract(scores["divergence"], r["floor"])
-        likelihood = np.array(scores["log_likelihood_per_step"])
-        yield method, "log_likelihood_above_own", likelihood - r["own_log_likelihood"]
-        yield method, "log_likelihood_of_trajectory", likelihood * horizon
-        if m := len(strategies.get(method, ())):
-            yield method, "strategies", m
-            yield method, "steps_per_strategy", scores["steps"] / m
-            yield method, "search_steps_per_strategy", scores["search_steps"] / m
-    learner = "DMSRD" if "table" in r else "AIRL Batch"
-    for metric in SINGLE:
-        yield learner, metric, r.get(metric)
-    if r.get("ceiling"):
-        yield "fitted to true returns", "task_correlation", r["ceiling"]
-        yield "DMSRD", "share_of_ceiling", r["table"]["DMSRD"]["task_correlation"] / r["ceiling"]
-    if "later" in r:
-        yield "DMSRD", "strategies_for_later_mixtures", sum(x["steps"]["airl"] > 0 for x in r["later"])
-    if "stream_seconds" in r:
-        seconds = np.array([x["seconds"] for x in r["records"]])
-        usual = np.where(np.isin(np.arange(len(seconds)), r["pure"]), np.nan, seconds)
-        yield "DMSRD", "minutes", None if r["resumed"] else r["stream_seconds"] / 60
-        yield "DMSRD", "last_ten_over_second_ten", seconds[-10:].mean() / seconds[10:20].mean()
-        yield "DMSRD", "usual_last_ten_over_second_ten", np.nanmean(usual[-10:]) / np.nanmean(usual[10:20])
-        thresholds = [x["threshold"] for x in r["records"]]
-        yield "DMSRD", "users_above_threshold", sum(np.greater(r["table"]["divergence"], thresholds))
+    r, few = record["results"], record["settings"].get("few")
+    floor, own = np.array(r["floor"]), np.array(r["own_log_likelihood"])
+    yield "demonstrator", "divergence", floor
+    yield "demonstrator", "log_likelihood_per_step", own
+    for method, scores in r["table"].items():
+        yield from _scores(method, scores, domain, floor, own)
+    for name, scores in r.get("variants", {}).items():
+        yield from _scores(f"variant: {name}", scores, domain, floor[few], own[few])
+    for name, scores in r.get("worth", {}).items():
+        yield from _scores(f"fresh policies on: {name}", scores, domain, None, None)
+    for name, found in r.get("correlations", {}).items():
+        yield from ((f"reward: {name}", kind, value) for kind, value in found.items())
 
 
-def _scores(r: dict) -> dict[str, dict[str, Any]]:
-    """Metrics by method, of any record; lists hold a value for each demonstration."""
-    if "table" in r:
-        return r["table"] if "DMSRD" in r["table"] else {"DMSRD": r["table"]}
-    names = {"divergence": "kl", "log_likelihood_per_step": "log_likelihood", "failure_share": "failures",
-             "environment_return": "returns"}  # fmt: skip
-    scores: dict[str, dict] = {m: {name: r[key][m] for name, key in names.items()} for m in r["kl"]}
-    known = {"task_correlation": "AIRL Batch", "task_correlation_without_coverage": "without coverage"}
-    scores["AIRL Batch"] |= {metric: r["correlation"][key] for metric, key in known.items()}
-    return scores
+def _scores(
+    method: str, scores: dict, domain: Domain, floor: np.ndarray | None, own: np.ndarray | None
+) -> Iterator[tuple[str, str, Any]]:
+    """The metrics of one row, and what follows from them."""
+    yield from ((method, metric, value) for metric, value in scores.items() if "curve" not in metric)
+    returns, failures = (np.array(scores[name]) for name in ("environment_return", "failure_share"))
+    yield method, "able", solves(domain, returns, failures)
+    if floor is not None and own is not None:
+        yield method, "divergence_above_floor", np.subtract(scores["divergence"], floor)
+        yield method, "log_likelihood_above_own", np.subtract(scores["log_likelihood_per_step"], own)
 
 
 def page(table: pd.DataFrame) -> str:
-    """``results.md`` with the table of the records in its place: one row for each record and method."""
-    rows = []
-    for (record, method), found in table.groupby(["record", "method"], sort=False):
-        known = found.drop_duplicates("metric").set_index("metric")["value"]
-        cells = [f"{known[m]:.3g}" if m in known else "-" for m in SHOWN]
-        rows.append(f"| {record} | {method} | {' | '.join(cells)} |")
-    head = [f"| record | method | {' | '.join(SHOWN.values())} |", "|---" * (len(SHOWN) + 2) + "|"]
-    text = "\n".join([*head, *rows]) if rows else "*No record yet.*"
+    """``results.md`` with the table of the records in its place: for each lesson and domain one row for each
+    method, means over seeds."""
+    parts = []
+    for (lesson, domain), found in table.groupby(["lesson", "domain"], sort=False):
+        rows = found.pivot_table("value", "method", "metric", sort=False)
+        shown = [name for name in SHOWN if name in rows]
+        seeds = found["seed"].nunique()
+        parts.append(f"### {lesson}, {DOMAINS[domain].title} ({seeds} seed{'s' * (seeds > 1)})\n")
+        parts.append(f"| method | {' | '.join(SHOWN[name] for name in shown)} |")
+        parts.append("|---" * (len(shown) + 1) + "|")
+        for method, row in rows[rows[shown].notna().any(axis=1)].iterrows():
+            cells = ["-" if np.isnan(row[name]) else f"{row[name]:.3g}" for name in shown]
+            parts.append(f"| {str(method).replace('|', chr(92) + '|')} | {' | '.join(cells)} |")
+        parts.append("")
+    text = "\n".join(parts).strip() or "*No record yet.*"
     return Path(__file__).with_suffix(".md").read_text("utf-8").replace("{records}", text)
 
 

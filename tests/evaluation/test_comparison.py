@@ -12,10 +12,23 @@ from dmsrd_lite.evaluation import comparison
 from dmsrd_lite.evaluation.comparison import METHODS, MethodSettings, score_method, train_method
 from dmsrd_lite.evaluation.metrics import reward_correlation
 from dmsrd_lite.method.dmsrd import learn
+from dmsrd_lite.method.rewards import MeanRewards
 from dmsrd_lite.method.state import State
 
-SETTINGS = {"ours": MethodSettings(tiny.AIRL_ONE, tiny.MSRD_ONE, tiny.TINY)}
+SETTINGS = {"ours": MethodSettings(tiny.AIRL_ONE, tiny.MSRD_ONE, tiny.TINY, tiny.AIRL_ONE)}
 SETTINGS["paper"] = SETTINGS["ours"].as_in_the_paper()
+NOTHING = {
+    "start": "nothing",
+    "coverage": "none",
+    "penalty_weight": 1.0,
+    "n_iterates": 4,
+    "iterates_share": 1.0,
+}
+FROM_NOTHING = MethodSettings(
+    replace(tiny.AIRL_ONE, **NOTHING),
+    replace(tiny.MSRD_ONE, **NOTHING),
+    batch=replace(tiny.AIRL_ONE, **NOTHING),
+)
 RUNS = [("cloning", "ours"), *((method, variant) for method in METHODS[1:] for variant in SETTINGS)]
 SCORES = ("divergence", "log_likelihood_per_step", "task_correlation", "recognized", "environment_return")
 
@@ -41,6 +54,19 @@ def test_what_is_stored_scores_the_same(given, method, variant, request):
         assert scores["task_correlation"] == pytest.approx(by_hand)
     assert (method == "cloning") == (learned.rewards is None)
     assert scores["recognized"] == scores["recognized_again"] or method in ("cloning", "AIRL Batch")
+
+
+@pytest.mark.parametrize("method", ["AIRL Single", "AIRL Batch", "MSRD"])
+def test_from_nothing_the_mean_of_functions_is_learned_and_stored(method, small_set):
+    learned = train_method(method, small_set, FROM_NOTHING, 0)
+    assert isinstance(learned.rewards, MeanRewards)
+    stored = comparison.restore(learned.tensors(), small_set, learned.rewards.alpha, learned.pure)
+    states = small_set.observations
+    for part in ("g", "task") if method == "MSRD" else ("g",):
+        assert np.array_equal(stored.rewards.evaluate(states, part), learned.rewards.evaluate(states, part))
+    steps, *rewards = np.array(learned.curve).T
+    assert steps.tolist() == [50, 100]
+    assert len(rewards) == learned.policies.n_strategies
 
 
 def test_a_method_spends_what_its_settings_and_records_say(small_set):

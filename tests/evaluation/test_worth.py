@@ -8,7 +8,7 @@ from dmsrd_lite.domains import LUNAR_LANDER, InputError
 from dmsrd_lite.evaluation import worth
 from dmsrd_lite.learning.policy_optimization import TrainingSettings
 from dmsrd_lite.learning.rollouts import rollout
-from dmsrd_lite.method.airl import MeanRewards, Rewards
+from dmsrd_lite.method.rewards import MeanRewards, Rewards
 
 SHORT = TrainingSettings(n_strategies=3, n_iterations=6, episodes=8, first_horizon=20, growing=1e9)
 

@@ -9,7 +9,8 @@ from dmsrd_lite.domains import InputError
 from dmsrd_lite.learning.networks import to_tensor
 from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method import airl
-from dmsrd_lite.method.airl import AIRL, AIRLSettings, Rewards, clone_demonstrations, discriminator_loss
+from dmsrd_lite.method.airl import AIRL, AIRLSettings, clone_demonstrations, discriminator_loss
+from dmsrd_lite.method.rewards import Rewards
 
 AS_IN_THE_PAPER = {"start": "nothing", "coverage": "none"}
 ONCE = {"start": "nothing", "coverage": "once"}
@@ -140,7 +141,7 @@ def test_the_discriminator_compares_f_with_log_pi_and_half_of_its_samples_are_co
     learner.replay = [(*replayed[:2], torch.full((2, 30), -2.0))]
     learner.coverage = [(x, x_next, torch.full(x.shape[:2], 1.0))]
     monkeypatch.setattr(learner.policies, "log_density", lambda x, a: torch.full(x.shape[:2], -0.5))
-    loss, accuracy = learner._discriminate(0)
+    loss, accuracy = learner._discriminate(0, learner._log_densities())
     shown, flown, covered = (1 / (1 + np.exp(log_pi)) for log_pi in (-0.5, -2.0, 1.0))
     written = -np.log(shown) - (np.log(1 - flown) + np.log(1 - covered)) / 2
     assert loss.tolist() == pytest.approx([written] * 2, rel=1e-5)
@@ -191,22 +192,51 @@ def test_the_gradient_penalty_by_finite_differences(small_set):
 
 
 def test_c_falls_while_the_policy_is_wider_than_what_was_shown(small_set):
+    """``log N`` of actions 0.3 from the mean, by hand; a policy's own mean log-density: minus its entropy."""
     settings = replace(AIRL_ONE, entropy_weight=0.05, entropy_tuning=0.1, start="nothing")
+    learner = AIRL(small_set, settings, 0)
     for sigma, direction in ((3.0, -1), (0.05, 1)):
-        learner = AIRL(replace(small_set, actions=0 * small_set.actions), settings, 0)
-        with torch.no_grad():
-            learner.policies.log_sigma.fill_(np.log(sigma))
-            learner.policies.network.weights[-1].zero_()
-        if direction == 1:
-            learner.actions += 0.3
-        own = np.full(2, -0.5 - np.log(sigma) - 0.5 * np.log(2 * np.pi))  # of its own samples
-        learner.tune_entropy(own)
+        own = -0.5 - np.log(sigma) - 0.5 * np.log(2 * np.pi)
+        shown = own + 0.5 - 0.5 * (0.3 / sigma) ** 2
+        learner.entropy_weights = np.full(2, 0.05)
+        learner.tune_entropy(np.full(2, shown), np.full(2, own))
         assert (np.sign(learner.entropy_weights - 0.05) == direction).all()
-    shown = -0.5 * (0.3 / 0.05) ** 2 + 0.5  # above ``own``, by hand; the change is at most one nat
-    assert learner.entropy_weights == pytest.approx(0.05 * np.exp(0.1 * min(-shown, 1)))
-    fixed = AIRL(small_set, replace(settings, entropy_tuning=0.0), 0)
-    fixed.tune_entropy(own)
-    assert (fixed.entropy_weights == 0.05).all()
+        expected = 0.05 * np.exp(0.1 * np.clip(0.5 * (0.3 / sigma) ** 2 - 0.5, -1, 1))
+        assert learner.entropy_weights == pytest.approx(expected)
+    for _ in range(100):
+        learner.tune_entropy(np.zeros(2), np.full(2, 9.0))
+    assert (learner.entropy_weights == 0.1).all(), "bounded"
+
+
+def test_c_follows_the_demonstrations_while_training(small_set):
+    settings = replace(AIRL_ONE, entropy_weight=0.05, start="nothing", first_sigma=1.0)
+    (*_, fixed), (*_, tuned) = (
+        [
+            r["entropy_weight"].copy()
+            for r in AIRL(small_set, replace(settings, entropy_tuning=rate), 0).train()
+        ]
+        for rate in (0.0, 0.1)
+    )
+    assert (fixed == 0.05).all()
+    assert (tuned < 0.05).all(), "the untrained policy is wider than what was shown"
+
+
+def test_the_average_of_policies_by_hand(small_set):
+    learner = AIRL(small_set, replace(AIRL_ONE, n_iterations=3, policy_average=0.5), 0)
+    seen = [learner.policies.log_sigma.clone().detach() for _ in learner.train()]
+    first, second, third = seen
+    second = 0.25 * first + 0.75 * second  # decays: 0, 1/4, 2/5, and never more than 0.5
+    assert torch.allclose(learner.learned_policies.log_sigma, 0.4 * second + 0.6 * third)
+    assert not torch.equal(learner.policies.log_sigma, learner.learned_policies.log_sigma)
+    last = AIRL(small_set, AIRL_ONE, 0)
+    assert last.learned_policies is last.policies
+
+
+def test_the_policy_learns_more_slowly_in_the_second_half(small_set):
+    learner, rates = AIRL(small_set, replace(AIRL_ONE, n_iterations=4, last_rate=0.2), 0), []
+    for _ in learner.train():
+        rates.append(learner.optimizer.optimizer.param_groups[0]["lr"] / AIRL_ONE.ppo.learning_rate)
+    assert rates == pytest.approx([1, 1, 1, 0.6])
 
 
 def test_episodes_grow_when_the_discriminator_can_no_longer_tell(small_set):
@@ -270,9 +300,17 @@ def test_the_mean_of_iterates_is_of_functions_not_of_weights(small_set):
         ({"penalty_weight": -1.0}, "penalty_weight -1.0: expected a number of at least 0"),
         ({"entropy_weight": -0.1}, "entropy_weight -0.1: expected a number of at least 0"),
         ({"penalty_slope": 0.0}, "penalty_slope 0.0: expected a positive number"),
-        ({"growth": 0.9}, "growth 0.9 from first_horizon 0: expected a growth of at least 1 from"),
+        ({"growth": 0.9}, "growth 0.9 from first_horizon 0: expected a growth above 1 from"),
+        ({"growth": 1.0, "first_horizon": 30}, "growth 1.0 from first_horizon 30: expected a growth above 1"),
+        ({"policy_average": 1.5}, "policy_average 1.5: expected a share of at most 1"),
+        ({"iterates_share": 0.0}, "iterates_share 0.0: expected a share of at most 1"),
     ],
 )
 def test_settings_that_cannot_be_are_one_sentence(change, sentence):
     with pytest.raises(InputError, match=f"^{sentence}[^\\n]*$"):
         AIRLSettings(**change)
+
+
+def test_a_first_horizon_needs_a_horizon_to_grow_to(small_set):
+    with pytest.raises(InputError, match=r"^first_horizon 60: expected at most the demonstrations' 50 steps"):
+        AIRL(small_set, replace(AIRL_ONE, first_horizon=60), 0)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from dmsrd_lite.method.airl import Rewards
 from dmsrd_lite.method.between_class_discrimination import between_class_loss, recognized, relative_to_own
+from dmsrd_lite.method.rewards import Rewards
 
 PURE = torch.tensor([0, 3])
 WEIGHTS = torch.tensor([[1.0, 0.0], [0.3, 0.7], [0.9, 0.1], [0.0, 1.0], [0.5, 0.5]], dtype=torch.float64)

@@ -10,8 +10,9 @@ from tiny import AIRL_ONE, MSRD_ONE, same
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method import airl
-from dmsrd_lite.method.airl import AIRL, Rewards, discriminator_loss
+from dmsrd_lite.method.airl import AIRL, discriminator_loss
 from dmsrd_lite.method.msrd import MSRD
+from dmsrd_lite.method.rewards import Rewards
 
 WEIGHTS, PURE = np.array([[1.0, 0.0], [0.0, 1.0], [0.4, 0.6]]), (0, 1)
 STATES = np.random.default_rng(0).normal(size=(50, 4))
@@ -46,7 +47,7 @@ def one_step(learner):
     """What a gradient step of size 1 subtracts from the rewards' parameters: the gradient of the loss."""
     learner.reward_optimizer = torch.optim.SGD(learner.rewards.parameters(), lr=1.0)
     before = {k: v.clone() for k, v in learner.rewards.state_dict().items()}
-    learner._discriminate(7)
+    learner._discriminate(7, learner._log_densities())
     return {k: before[k] - v for k, v in learner.rewards.state_dict().items()}
 
 

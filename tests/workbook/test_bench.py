@@ -7,7 +7,7 @@ from dmsrd_lite.__main__ import main
 
 @pytest.mark.verify
 def test_bench_ends_with_one_json_line(capsys):
-    assert main(["bench", "--json", "--iterations", "2"]) == 0
+    assert main(["bench", "--json", "--iterations", "2", "--from-nothing", "6"]) == 0
     *table, last = capsys.readouterr().out.strip().splitlines()
     result = json.loads(last)
     assert result["ratio"] == round(result["training_steps_per_s"] / result["simulator_steps_per_s"], 3)
@@ -15,3 +15,7 @@ def test_bench_ends_with_one_json_line(capsys):
     assert 0 < result["ratio"] < 1
     assert result["settings"]["n_environments"] == 80
     assert any("discriminator" in line for line in table), "where the time goes must be printed"
+    for found in result["from_nothing"].values():
+        assert 0 < found["ratio"] < 1
+        assert found["steps_per_s"] > 0
+        assert found["seconds_to_balance"] is found["steps_to_balance"] is None, "six iterations are too few"

@@ -1,8 +1,10 @@
 """RESULTS.md, the CSV and the table of parameters are what the command makes of the records."""
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from dmsrd_lite.domains import DOMAINS
 from dmsrd_lite.workbook import results
 from dmsrd_lite.workbook.lessons import lessons
 from dmsrd_lite.workbook.records import RECORDS, ROOT
@@ -40,9 +42,27 @@ def test_pictures_and_links_of_the_page_exist(written):
     assert all((ROOT / link).exists() for link in links)
 
 
-def test_the_page_shows_a_row_for_each_record_and_method():
-    rows = [["02_x", "02_airl", "inverted_pendulum", 0, "AIRL", "environment_return", -3.14159]]
+def test_the_page_shows_a_row_for_each_method_and_means_over_seeds():
+    rows = [
+        ["02_x", "02_airl", "inverted_pendulum", seed, "AIRL", "environment_return", value]
+        for seed, value in ((0, -3.0), (1, -4.0))
+    ]
     page = results.page(pd.DataFrame(rows, columns=results.COLUMNS))
-    assert "\n| 02_x | AIRL | - | - | -3.14 | - | - | - |\n" in page
+    assert "### 02_airl, Inverted Pendulum (2 seeds)" in page
+    assert "\n| AIRL | -3.5 |" in page
     assert "No record yet" not in page
     assert "No record yet" in results.page(pd.DataFrame([], columns=results.COLUMNS))
+
+
+def test_what_follows_from_a_row_by_hand():
+    scores = {"environment_return": [-5.0, -700.0], "failure_share": [0.0, 0.5], "divergence": [2.0, 4.0],
+              "log_likelihood_per_step": [0.1, 0.3], "curve": [[1]]}  # fmt: skip
+    row = {"floor": [0.5, 1.5], "own_log_likelihood": [0.2, 0.2], "table": {"AIRL": scores}}
+    row |= {"correlations": {"AIRL": {"pearson": 0.9}}}
+    found = results._numbers({"results": row, "settings": {}}, DOMAINS["inverted_pendulum"])
+    found = {(method, metric): np.mean(value) for method, metric, value in found}
+    assert found["AIRL", "able"] == 0.5
+    assert found["AIRL", "divergence_above_floor"] == pytest.approx(2.0)
+    assert found["AIRL", "log_likelihood_above_own"] == pytest.approx(0.0)
+    assert found["reward: AIRL", "pearson"] == 0.9
+    assert ("AIRL", "curve") not in found
