@@ -90,7 +90,7 @@ def bench(seed: int = 0, n_iterations: int = 6, n_from_nothing: int = 0) -> dict
     (cloning, coverage and the first iteration) is what the steady state leaves out.
     """
     check_whole(n_iterations, "iterations", 2)  # the first is start-up
-    usual = presets.choose("02_airl", INVERTED_PENDULUM.name, "full").airl
+    usual = presets.METHODS[INVERTED_PENDULUM.name].airl
     shown, settings = load_shipped(INVERTED_PENDULUM), dataclasses.replace(usual, n_iterations=n_iterations)
     start = time.perf_counter()
     learner = AIRL(shown, settings, seed)
