@@ -56,9 +56,7 @@ class Learned:
     steps: int = 0  # environment steps of training, all strategies together
     search_steps: int = 0
     seconds: float = 0.0
-    curve: Sequence[
-        Sequence[float]
-    ] = ()  # by iteration: steps of a strategy so far, true reward per step (M)
+    curve: Sequence[Sequence[float]] = ()  # by iteration: a strategy's steps, true reward per step (M)
 
     def actor(self) -> Mixtures:
         return Mixtures(self.policies.actor(), self.weights)

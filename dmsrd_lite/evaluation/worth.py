@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -32,9 +32,10 @@ class Worth:
     curves: np.ndarray
     steps: int
 
-    def solved(self, domain: Domain) -> np.ndarray:
-        """Who can do the task, (n,) bool (``solves``)."""
-        return solves(domain, self.returns, self.failure_share)
+    def scores(self) -> dict[str, Any]:
+        """A row of a table or record, named as ``metrics.score_policies`` names its own."""
+        row = {"environment_return": self.returns, "failure_share": self.failure_share}
+        return {**row, "curves": self.curves.round(4), "steps": self.steps}
 
 
 def solves(domain: Domain, returns: np.ndarray, failure_share: np.ndarray) -> np.ndarray:
@@ -43,6 +44,11 @@ def solves(domain: Domain, returns: np.ndarray, failure_share: np.ndarray) -> np
     Where starts decide as much as policies do (``matched_starts``) a failure is forgiven.
     """
     return (returns >= domain.success_return) & (domain.comparison.matched_starts | (failure_share == 0))
+
+
+def able(domain: Domain, scores: dict[str, Any]) -> np.ndarray:
+    """``solves`` for a row of a table or record, lists or arrays: (n,) bool."""
+    return solves(domain, *(np.array(scores[key]) for key in ("environment_return", "failure_share")))
 
 
 def reward_worth(

@@ -44,9 +44,7 @@ class AIRLSettings:
     first_sigma: float = 0.2  # of an untrained policy, share of half the action range
     policy_base: str = "g"  # what the policy is paid: "g" as in the paper, or "f" ...
     entropy_weight: float = 0.0  # ... less this weight c times log pi; "f" with c = 1 is log D - log(1 - D)
-    entropy_tuning: float = (
-        0.0  # how fast c follows the demonstrations (``AIRL.tune_entropy``); 0: c is fixed
-    )
+    entropy_tuning: float = 0.0  # how fast c follows the demonstrations (``tune_entropy``); 0: not at all
     cloning_weight: float = 1.0  # of the demonstration's negative log-likelihood in a clone's loss
     cloning_steps: int = 2000
     coverage: str = (
@@ -89,9 +87,7 @@ class AIRLSettings:
         if not self.penalty_slope > 0:
             raise InputError(f"penalty_slope {self.penalty_slope!r}: expected a positive number")
         if self.first_horizon < 0 or self.growth < 1 or (self.first_horizon and self.growth == 1):
-            text = (
-                "expected a growth above 1 from a first horizon of at least 1 step, or 0 for whole episodes"
-            )
+            text = "expected a growth above 1 from a first horizon of at least 1 step, or 0: whole episodes"
             raise InputError(f"growth {self.growth!r} from first_horizon {self.first_horizon!r}: {text}")
 
 

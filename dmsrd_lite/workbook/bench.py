@@ -16,6 +16,8 @@ from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method.airl import AIRL
 from dmsrd_lite.workbook import presets
 
+THREADS = sorted({1, 2, os.cpu_count() or 1})  # the best of these counts
+
 
 def simulator_speed(
     shown: DemonstrationSet, n_environments: int, n_threads: int, n_steps: int = 300
@@ -63,12 +65,12 @@ def from_nothing(people: Sequence[int], seed: int, n_iterations: int = 0) -> dic
         if record["iteration"] % 5 == 4 or record["iteration"] == settings.n_iterations - 1:
             n_steps, before = (record["steps"] - before) * len(people), record["steps"]
             n_environments = len(people) * record["episodes"]
-            raw = max(simulator_speed(shown, n_environments, n) for n in (1, 2, os.cpu_count() or 1))
+            raw = max(simulator_speed(shown, n_environments, n) for n in THREADS)
             raw_seconds += n_steps / raw
             trial = rollout(domain, learner.policies.actor(), 20, [seed, 97, record["iteration"]])
             in_a_row = np.where(trial.failed.any((1, 2)), 0, in_a_row + 1)
             balances |= in_a_row >= 3
-            if balances.all() and to_balance is None:
+            if balances.all():
                 to_balance = round(seconds, 1), record["steps"]
                 break
     return {
@@ -98,7 +100,7 @@ def bench(seed: int = 0, n_iterations: int = 6, n_from_nothing: int = 0) -> dict
     training = learner.train()
     next(training)
     start_up = time.perf_counter() - start
-    speeds: dict[int, list[float]] = {n: [] for n in sorted({1, 2, os.cpu_count() or 1})}
+    speeds: dict[int, list[float]] = {n: [] for n in THREADS}
     records = []
     for record in training:
         records.append(record["seconds"])

@@ -9,7 +9,7 @@ import pandas as pd
 
 from dmsrd_lite.demonstrations import write_atomically
 from dmsrd_lite.domains import DOMAINS, Domain
-from dmsrd_lite.evaluation.worth import solves
+from dmsrd_lite.evaluation.worth import able
 from dmsrd_lite.workbook.lessons import lessons
 from dmsrd_lite.workbook.records import RECORDS, ROOT, load_record
 
@@ -73,8 +73,7 @@ def _scores(
 ) -> Iterator[tuple[str, str, Any]]:
     """The metrics of one row, and what follows from them."""
     yield from ((method, metric, value) for metric, value in scores.items() if "curve" not in metric)
-    returns, failures = (np.array(scores[name]) for name in ("environment_return", "failure_share"))
-    yield method, "able", solves(domain, returns, failures)
+    yield method, "able", able(domain, scores)
     if floor is not None and own is not None:
         yield method, "divergence_above_floor", np.subtract(scores["divergence"], floor)
         yield method, "log_likelihood_above_own", np.subtract(scores["log_likelihood_per_step"], own)

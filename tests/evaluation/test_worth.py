@@ -30,6 +30,9 @@ def test_fresh_policies_follow_the_reward_that_they_are_given(domain):
     assert good.curves.shape == (25, 3)
     assert (good.curves[-5:].mean(0) > bad.curves[-5:].mean(0) + 0.02).all()
     assert (bad.failure_share == 1).all()
+    row = good.scores()
+    assert worth.able(domain, row).tolist() == worth.solves(domain, good.returns, good.failure_share).tolist()
+    assert row["curves"] == pytest.approx(good.curves, abs=1e-4)
 
 
 def test_the_same_seed_the_same_worth_and_no_true_reward(domain, monkeypatch):
