@@ -60,6 +60,7 @@ SHIPPED = str(DATA_FOLDER / "inverted_pendulum_demonstrations.npz")
         ("04_policy_mixture", {"weight": 2.0}, "weight 2.0: expected a number from 0 to 1"),
         ("05_between_class_discrimination", {"n_iterations": -1}, "n_iterations -1: expected a whole number"),
         ("06_dmsrd", {"kl_threshold": -1.0}, "kl_threshold -1.0: expected a number from"),
+        ("06_dmsrd", {"form": "theirs"}, "form 'theirs' from start 'clone': expected one of ours, clone; "),
         ("06_dmsrd", {"demonstrations_path": "none.npz"}, "there is no such file"),
         (
             "06_dmsrd",

@@ -25,6 +25,7 @@ TINY = DMSRDSettings(
     msrd=replace(MSRD_ONE, n_iterations=1, between_class_extra=2),
     mixture=MixtureSettings(4, 2, search_rollouts=1, n_finalists=2, final_rollouts=2),
     measured_rollouts=2,
+    own_rollouts=0,
 )
 ROUGH = replace(TINY, airl=replace(TINY.airl, cloning_steps=10))  # where no KL of a new strategy counts
 GENEROUS = replace(ROUGH, kl_threshold=1e9)  # every mixture will do

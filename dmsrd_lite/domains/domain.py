@@ -47,6 +47,9 @@ class StateComparison:
     matched_starts: bool = (
         False  # starts differ more than strategies do: pool trajectories, roll out from the same starts
     )
+    alike: Callable[[np.ndarray], np.ndarray] | None = (
+        None  # states in which everybody is alike, as a lander on its legs: (..., obs_dim) -> (...) bool
+    )
     own_at_most: float = 1.0  # nats between one demonstrator's own trajectories ...
     others_at_least: float = 3.0  # ... and between two demonstrators
 
@@ -137,6 +140,11 @@ class Domain:
     def on_threads(self, n_threads: int) -> "Domain":
         """The same domain, simulated on ``n_threads`` threads or worker processes (0: all cores)."""
         return replace(self, simulator=replace(self.simulator, n_threads=n_threads))
+
+    def tells(self, observations: np.ndarray) -> np.ndarray:
+        """Does a state say something about who acts? (..., obs_dim) -> (...) bool."""
+        alike = self.comparison.alike
+        return ~alike(observations) if alike else np.ones(observations.shape[:-1], dtype=bool)
 
     def first_failure(self, states: np.ndarray, rewards: np.ndarray) -> int:
         """The step at which new states (T, obs_dim) and rewards (T,) first fail; T if they never do."""

@@ -81,7 +81,7 @@ def describe(observations: np.ndarray) -> dict[str, float | str]:
     From which side the pad is approached (mean x over the upper part of the way, half widths), how long it
     takes to the first touch (s), and how far the lander leans (largest angle in flight, rad).
     """
-    touches = observations[..., 6:8].max(-1) > 0  # (k, T+1)
+    touches = on_its_legs(observations)  # (k, T+1)
     steps = np.where(touches.any(1), touches.argmax(1), touches.shape[1] - 1)
     flights = [one[: step + 1] for one, step in zip(observations, steps, strict=True)]
     side = float(
@@ -97,6 +97,11 @@ def describe(observations: np.ndarray) -> dict[str, float | str]:
         "first touch (s)": seconds,
         "largest angle (rad)": lean,
     }
+
+
+def on_its_legs(observations: np.ndarray) -> np.ndarray:
+    """Touches the ground with a leg: (..., 8) -> (...) bool."""
+    return observations[..., 6:8].max(-1) > 0
 
 
 _UNITS = (0.1, 0.2, 0.1)
@@ -122,6 +127,7 @@ LUNAR_LANDER = Domain(
         coordinates=(0, 1, 2, 3, 4, 5),  # not the legs' contacts: they are 0 or 1
         resolution=0.01,
         matched_starts=True,
+        alike=on_its_legs,
         others_at_least=1.0,
     ),
     exploration=Exploration(((10.0, 0.0), (30.0, 0.0), (1.0, 2.0))),  # only failures: near misses hurt R_Task

@@ -21,7 +21,9 @@ from dmsrd_lite.method.policy_mixture import Mixtures
 from dmsrd_lite.method.rewards import MeanRewards, Rewards
 from dmsrd_lite.method.state import State
 
-METHODS = ("cloning", "AIRL Single", "AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD")
+METHODS = (
+    "cloning", "AIRL Single", "AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD as printed", "DMSRD",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -32,14 +34,6 @@ class MethodSettings:
     msrd: MSRDSettings = MSRDSettings(n_iterations=25, discriminator_steps=24)
     dmsrd: DMSRDSettings = DMSRDSettings()
     batch: AIRLSettings = AIRLSettings(n_iterations=25, discriminator_steps=40)  # one model for all the data
-
-    def as_in_the_paper(self) -> "MethodSettings":
-        """From nothing without coverage, and AIRL for a new strategy on its own reward alone."""
-        off: dict[str, Any] = {"start": "nothing", "coverage": "none"}
-        airl, msrd = replace(self.dmsrd.airl, **off), replace(self.dmsrd.msrd, **off)
-        loop = replace(self.dmsrd, airl=airl, msrd=msrd, add_task_reward=False)
-        alone = {name: replace(getattr(self, name), **off) for name in ("airl", "msrd", "batch")}
-        return replace(self, dmsrd=loop, **alone)
 
 
 @dataclass(frozen=True)
@@ -80,7 +74,11 @@ def train_method(
         raise InputError(f"unknown method {method!r}: expected one of {', '.join(METHODS)}")
     start, n = time.perf_counter(), shown.n_demonstrations
     if method.startswith("DMSRD"):
-        loop = replace(settings.dmsrd, between_class=method == "DMSRD")
+        loop = settings.dmsrd
+        if method == "DMSRD as printed":
+            loop = loop.as_printed()
+        elif method != "DMSRD":
+            loop = replace(loop, between_class="never")
         *_, state = progress(learn(State(shown.domain, seed), shown, loop))
         return learned_by(state)
     pure, weights, part = tuple(range(n)), np.eye(n), "g"
@@ -107,7 +105,8 @@ def train_method(
 def learned_by(state: State) -> Learned:
     """What DMSRD has learned from the demonstrations so far."""
     steps = [record["steps"] for record in state.records]
-    spent = sum(s["airl"] + s["msrd"] for s in steps), sum(s["search"] for s in steps)
+    training = sum(s["airl"] + s["msrd"] + s["between_class"] for s in steps)
+    spent = training, sum(s["search"] for s in steps)
     seconds = sum(record["seconds"] for record in state.records)
     return Learned(state.policies(), state.weights, state.rewards(), "task", state.pure, *spent, seconds)
 

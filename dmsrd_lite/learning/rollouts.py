@@ -114,19 +114,23 @@ def rollout(
     *,
     reset_seeds: np.ndarray | None = None,
     horizon: int = 0,
+    common: bool = False,
 ) -> Rollouts:
     """Simulate ``n_episodes`` of every policy of ``actor``: ``a_t = mu_j(s_t) + sigma_j eps_t``, executed as
     ``clip(a_t)``.
 
     ``seed`` fixes starts and action noise; ``reset_seeds`` (M, E) fixes the starts alone. ``horizon`` 0 means
-    the domain's own. The same seed gives the same bits however many threads or processes ``domain.simulator``
+    the domain's own. ``common``: all policies meet the same starts and the same noise (common random
+    numbers). The same seed gives the same bits however many threads or processes ``domain.simulator``
     uses.
     """
     rng = np.random.default_rng(seed)
     m, e, t_end = actor.n_strategies, n_episodes, horizon or domain.horizon
-    drawn = draw_reset_seeds(rng, m, e)
-    reset_seeds = drawn if reset_seeds is None else np.asarray(reset_seeds)
-    noise = rng.standard_normal((t_end, m, e, domain.action_dim), dtype=np.float32)
+    n_draws = 1 if common else m
+    drawn = draw_reset_seeds(rng, n_draws, e)
+    reset_seeds = np.broadcast_to(drawn, (m, e)) if reset_seeds is None else np.asarray(reset_seeds)
+    noise = rng.standard_normal((t_end, n_draws, e, domain.action_dim), dtype=np.float32)
+    noise = np.repeat(noise, m // n_draws, axis=1)
     log_densities = gaussian_log_density(noise, np.float32(0), np.float32(1)) - np.log(actor.sigma).sum(-1)
     noise *= actor.sigma
     # Always the same two halves, and so the same bits; on two threads one acts while the other is simulated.

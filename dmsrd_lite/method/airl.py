@@ -29,7 +29,8 @@ WORDS = {  # of the settings that are words
     "penalty_points": ("between", "samples", "demonstrations"),
 }
 ENTROPY_WEIGHTS = (0.002, 0.1)  # within which c is tuned
-REPLAY_SIZE = 100_000  # samples per strategy that a replay of all iterations holds at most
+REPLAY_SIZE = 100_000  # samples per strategy that a replay of all iterations holds at most ...
+N_ANCHORS = 4000  # ... and of which so many go on to a later learner
 Samples = tuple[
     torch.Tensor, torch.Tensor, torch.Tensor
 ]  # x (M, n, obs_dim), x' (M, n, obs_dim), log-density (M, n)
@@ -171,10 +172,10 @@ class AIRL:
         )
         if shared is not None:
             for rewards in (self.rewards, self.averaged_rewards):
-                rewards.task_reward.load_state_dict(shared.task_reward.state_dict())
-                rewards.task_reward.requires_grad_(False)
+                rewards.task_reward = copy.deepcopy(shared.task_reward).requires_grad_(False)
         self.replay: deque[Samples] = deque(maxlen=settings.replay_iterations or None)
         self.coverage: list[Samples] = []
+        self.anchors: list[Samples] = []  # of an earlier learner's replay: what it saw on the way
         self.iterates: list[Rewards] = []
         self.every = self.thinning = 1  # which iterations and samples are kept
         self.entropy_weights = np.full(m, settings.entropy_weight)  # c of each strategy
@@ -200,16 +201,30 @@ class AIRL:
 
     def networks(self) -> dict[str, torch.Tensor]:
         """Copies of all that a later learner needs, by name; the leading axis is the strategy's."""
-        modules = self.modules.items()
+        modules = {**self.modules, "policies": self.learned_policies}.items()
         found = {f"{name}.{k}": v.clone() for name, module in modules for k, v in module.state_dict().items()}
-        coverage = self._joined(self.coverage) if self.coverage else ()
-        return found | {f"coverage.{i}": part for i, part in enumerate(coverage)}
+        for name, samples in (("coverage", self.coverage), ("anchors", self.anchors or self._anchors())):
+            parts = self._joined(samples) if samples else ()
+            found |= {f"{name}.{i}": part for i, part in enumerate(parts)}
+        return found
+
+    def _anchors(self) -> list[Samples]:
+        """From nothing a learner sees failure only on the way: an even choice of all that was in its
+        replay."""
+        if self.settings.start == "clone" or not self.replay:
+            return []
+        x, x_next, log_pi = self._joined(list(self.replay))
+        some = torch.linspace(0, x.shape[1] - 1, N_ANCHORS).long()
+        return [(x[:, some], x_next[:, some], log_pi[:, some])]
 
     def _restore(self, networks: dict[str, torch.Tensor]) -> None:
         for name, module in self.modules.items():
             module.load_state_dict(under(name, networks))
-        if "coverage.0" in networks:
-            self.coverage = [(networks["coverage.0"], networks["coverage.1"], networks["coverage.2"])]
+        self.averaged_policies.load_state_dict(self.policies.state_dict())
+        for name in ("coverage", "anchors"):
+            if f"{name}.0" in networks:
+                x, x_next, log_pi = (networks[f"{name}.{i}"] for i in range(3))
+                setattr(self, name, [(x, x_next, log_pi)])
 
     def train(self, progress: Callable = iter) -> Iterator[dict]:
         """Run the iterations that are left; ``progress`` wraps the range (``tqdm`` for a bar).
@@ -219,7 +234,7 @@ class AIRL:
         and trains nothing; seconds by part.
         """
         s = self.settings
-        if s.coverage != "none" and not self.coverage and not self.iteration:
+        if s.coverage != "none" and not self.coverage and not self.anchors and not self.iteration:
             self._explore()
         for iteration in progress(range(self.iteration, s.n_iterations)):
             clock = [time.perf_counter()]
@@ -356,7 +371,8 @@ class AIRL:
         """Cross-entropy steps on demonstrations (``log_pi``: of their actions, (M, n)) against samples: loss
         and accuracy (M,) of the last one."""
         s, rng = self.settings, np.random.default_rng(seed)
-        pools = [self._joined(list(self.replay)), *([self._joined(self.coverage)] if self.coverage else [])]
+        pools = [self._joined([*self.anchors, *self.replay])]
+        pools += [self._joined(self.coverage)] if self.coverage else []
         near = self._near()
         for _ in range(s.discriminator_steps):
             pick = torch.from_numpy(near[rng.integers(0, len(near), s.discriminator_batch)])

@@ -5,6 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from dmsrd_lite.domains import Domain
+from dmsrd_lite.domains.domain import Seed
+
 
 def between_class_loss(mean_rewards: torch.Tensor, weights: torch.Tensor, pure: torch.Tensor) -> torch.Tensor:
     """``sum_i (exp(eta_S-j(tau_i)) - w_ij exp(eta_S-j(tau_m_j)))^2`` of each strategy j: (M,). Equation 4.
@@ -15,6 +18,14 @@ def between_class_loss(mean_rewards: torch.Tensor, weights: torch.Tensor, pure: 
     """
     own = mean_rewards.gather(1, pure[:, None]).detach().exp()  # (M, 1)
     return (mean_rewards.exp() - weights.T * own).square().sum(1)
+
+
+def states_of(domain: Domain, observations: np.ndarray, n_states: int, seed: Seed) -> np.ndarray:
+    """What Equation 4 is asked on: of each of n people (n, k, T+1, obs_dim) as many states that tell who
+    acts, drawn at random; (n, n_states, obs_dim)."""
+    rng = np.random.default_rng(seed)
+    telling = (one[domain.tells(one)] for one in observations)  # one: (k, T+1, obs_dim)
+    return np.stack([one[rng.integers(0, len(one), n_states)] for one in telling])
 
 
 def relative_to_own(mean_rewards: torch.Tensor, pure: torch.Tensor) -> torch.Tensor:

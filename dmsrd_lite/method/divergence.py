@@ -5,6 +5,7 @@ Paper: "Policy mixture optimisation"; Kozachenko and Leonenko (1987), Wang, Kulk
 """
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,6 +17,7 @@ from dmsrd_lite.learning.networks import Policies
 from dmsrd_lite.learning.rollouts import rollout
 
 K_NEIGHBORS = 3
+Measure = Callable[[Domain, np.ndarray, np.ndarray], float]  # of (a, T, obs_dim) shown and (b, T, obs_dim)
 
 
 def _kth_distance(tree: cKDTree, points: np.ndarray, k: int, resolution: float) -> np.ndarray:
@@ -108,9 +110,17 @@ def divergence_floor(
 
 
 def policy_divergences(
-    actor: Policies, demonstrations: DemonstrationSet, seed: Seed, *, n_rollouts: int = 10
+    actor: Policies,
+    demonstrations: DemonstrationSet,
+    seed: Seed,
+    *,
+    n_rollouts: int = 10,
+    common: bool = False,
+    measure: Measure = demonstration_divergence,
 ) -> np.ndarray:
     """KL of demonstration j, or of the only one, against fresh rollouts of policy j: (n_strategies,) nats.
+
+    ``common`` as in ``rollout``; ``measure``: another divergence, "other divergences fit too" (the paper).
 
     In a domain with ``matched_starts`` the rollouts start as the demonstration did, ``n_rollouts / k`` times
     (rounded, at least once) from each of its k starts; where the demonstrations hold no reset seeds, from as
@@ -126,8 +136,10 @@ def policy_divergences(
         else:
             known = np.broadcast_to(demonstrations.reset_seeds, (actor.n_strategies, shown.shape[1]))
             starts = np.tile(known, repeats)
-    data = rollout(domain, actor, n_rollouts, seed, reset_seeds=starts, horizon=demonstrations.horizon)
+    data = rollout(
+        domain, actor, n_rollouts, seed, reset_seeds=starts, horizon=demonstrations.horizon, common=common
+    )
     pairs = zip(
         np.broadcast_to(shown, (actor.n_strategies, *shown.shape[1:])), data.observations, strict=True
     )
-    return np.array([demonstration_divergence(domain, one, flown) for one, flown in pairs])
+    return np.array([measure(domain, one, flown) for one, flown in pairs])

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,11 @@ from dmsrd_lite.method.state import State
 
 MIXTURE, BETTER_MIXTURE, NEW_STRATEGY = "mixture", "mixture, better than a new strategy", "new strategy"
 
+AS_PRINTED: dict[str, Any] = {
+    "add_task_reward": False, "between_class": "mixtures", "own_rollouts": 0, "search_again": False,
+    "policies_after_mixture": True, "from_actions": False,
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class DMSRDSettings:
@@ -28,7 +34,10 @@ class DMSRDSettings:
     )
     kl_margin: float = 0.5  # nats above the reference (``kl_threshold.reference_divergence``)
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
-    between_class: bool = True
+    between_class: str = "always"  # Equation 4 after every branch, after "mixtures" only (the paper), "never"
+    own_rollouts: int = 20  # it is asked on so many of each person's explanation from new starts; 0: on what
+    # was shown (the paper)
+    search_again: bool = True  # an older mixture whose KL has risen above its eps (the paper: never)
     airl: AIRLSettings = AIRLSettings(n_iterations=12)
     msrd: MSRDSettings = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=24)  # a round
     mixture: MixtureSettings = MixtureSettings()
@@ -43,9 +52,31 @@ class DMSRDSettings:
         if self.kl_threshold < 0 or not np.isfinite(self.kl_threshold):
             expected = "expected a positive number of nats, or 0 to calibrate it"
             raise InputError(f"kl_threshold {self.kl_threshold!r}: {expected}")
-        if self.airl.coverage != self.msrd.coverage:
-            expected = "expected the same, because MSRD goes on with AIRL's"
-            raise InputError(f"coverage differs between airl and msrd: {expected}")
+        if self.between_class not in (words := ("always", "mixtures", "never")):
+            raise InputError(f"between_class {self.between_class!r}: expected one of {', '.join(words)}")
+        half = [one.coverage == "half" for one in (self.airl, self.msrd)]
+        for name, (first, second) in {"start": (self.airl.start, self.msrd.start), "coverage": half}.items():
+            if first != second:
+                expected = "expected the same, because MSRD goes on with what AIRL learned"
+                raise InputError(f"{name} differs between airl and msrd: {expected}")
+
+    def as_printed(self) -> "DMSRDSettings":
+        """Algorithm 1 as the paper prints it, from the same start: every deviation taken back."""
+        return replace(
+            self,
+            **{name: usual for name, usual in AS_PRINTED.items() if name != "from_actions"},
+            remembered=0,
+            msrd=replace(self.msrd, between_class_relative=False),
+            mixture=replace(self.mixture, from_actions=False),
+        )
+
+    @property
+    def form(self) -> str:
+        """In words: the start, and what deviates from the paper."""
+        known = {**vars(self), "from_actions": self.mixture.from_actions}
+        names = [name for name, usual in AS_PRINTED.items() if known[name] != usual]
+        start = self.airl.start + (" with coverage" if self.airl.coverage == "half" else "")
+        return f"from {start}, {', '.join(names) or 'as printed'}"
 
 
 def learn(state: State, demonstrations: DemonstrationSet, settings: DMSRDSettings) -> Iterator[State]:
@@ -66,7 +97,8 @@ def learn(state: State, demonstrations: DemonstrationSet, settings: DMSRDSetting
 def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> State:
     """Algorithm 1, lines 2 to 17, for one demonstration tau_i; the numbers are the paper's lines."""
     s, started, n = settings, time.perf_counter(), len(state.weights)
-    state, seed, steps = replace(state, alpha=s.msrd.alpha), [state.seed, 102, n], {"search": 0, "airl": 0}
+    state, seed = replace(state, alpha=s.msrd.alpha, form=s.form), [state.seed, 102, n]
+    steps = {"search": 0, "airl": 0}
     candidate = cache(
         partial(_candidate, state, new, s, [*seed, 2])
     )  # AIRL on tau_i, made when it is asked for
@@ -81,7 +113,7 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
     else:  # 8
         for _ in candidate().train():  # 9: train AIRL on tau_i: a policy and a strategy reward
             pass
-        learned, steps["airl"] = candidate().policies.actor(), candidate().steps
+        learned, steps["airl"] = candidate().learned_policies.actor(), candidate().steps
         kl_new = float(policy_divergences(learned, new, [*seed, 2, 9])[0])  # 10: KL_new
         if kl_mix < kl_new:  # 11: then AIRL leaves no trace
             branch, known = BETTER_MIXTURE, state.explained(new, fit.weights)  # 12: keep w, no new strategy
@@ -92,7 +124,7 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
     decision |= {"reference": reference, "weights": known.weights[n], "n_strategies": known.n_strategies}
     created = branch == NEW_STRATEGY
     known, seen, played = play_round(known, created, eps, s, seed)  # 7, 13, 17: MSRD and BCD for all
-    spent = {**steps, "search": steps["search"] + played["search"], "msrd": played["msrd"]}
+    spent = {**steps, **played, "search": steps["search"] + played["search"]}
     record = {**decision, **seen, "steps": spent, "seconds": time.perf_counter() - started}
     return replace(known, records=(*state.records, plain(record)))
 
@@ -114,10 +146,9 @@ def _check(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> None
         if before != now:
             expected = f"expected {before} (trajectories, steps, dimension) as before"
             raise InputError(f"a demonstration with {array} of shape {now} arrived; {expected}")
-    coverage = settings.msrd.coverage
-    if state.networks and ("coverage.0" in state.networks) != (coverage == "half"):
-        expected = "expected the same in both"
-        raise InputError(f"coverage is {coverage!r} in the settings, and not so in the state; {expected}")
+    if state.form not in ("", settings.form):
+        text = f"a state that was learned {state.form} cannot go on {settings.form}; expected the same form"
+        raise InputError(text)
 
 
 def _audited(state: State, settings: DMSRDSettings) -> State:

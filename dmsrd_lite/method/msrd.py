@@ -17,9 +17,11 @@ from dmsrd_lite.domains import InputError
 from dmsrd_lite.domains.domain import Seed
 from dmsrd_lite.learning.networks import to_tensor
 from dmsrd_lite.method.airl import AIRL, AIRLSettings
-from dmsrd_lite.method.between_class_discrimination import between_class_loss, recognized, relative_to_own
+from dmsrd_lite.method.between_class_discrimination import between_class_loss, relative_to_own
 
-Between = tuple[DemonstrationSet, np.ndarray, Sequence[int] | np.ndarray]  # all n, weights (n, M), pure (M,)
+Between = tuple[
+    np.ndarray, np.ndarray, Sequence[int] | np.ndarray
+]  # states of all n (n, k, obs_dim), weights (n, M), pure (M,)
 
 
 @dataclass(frozen=True)
@@ -30,15 +32,15 @@ class MSRDSettings(AIRLSettings):
         True  # count each strategy reward from its own demonstration (``relative_to_own``)
     )
     between_class_batch: int = 128  # states of every demonstration per step
-    between_class_extra: int = 20  # most further discriminator updates after training (``settle``)
+    between_class_extra: int = 10  # further updates of the strategy rewards after training (``settle``)
 
 
 class MSRD(AIRL):
     """AIRL for labelled demonstrations, one per strategy, with a shared task reward: its gradient is the sum
     over strategies.
 
-    ``between``: ``(demonstrations (n), weights (n, M), pure (M))`` adds between-class discrimination over all
-    n of them.
+    ``between``: ``(states (n, k, obs_dim), weights (n, M), pure (M))`` adds between-class discrimination
+    among all n people (``between_class_discrimination.states_of``).
     """
 
     settings: MSRDSettings
@@ -57,9 +59,9 @@ class MSRD(AIRL):
         self.alpha, self.between = settings.alpha, None
         super().__init__(demonstrations, settings, seed, networks=networks)
         if between is not None:
-            everyone, weights, pure = between
-            x = to_tensor(self.domain.network_input(everyone.transitions()[0]))  # (n, steps, obs_dim)
-            self.between, self.everyone = (x, to_tensor(weights), torch.as_tensor(np.asarray(pure))), everyone
+            states, weights, pure = between
+            x = to_tensor(self.domain.network_input(states))
+            self.between = x, to_tensor(weights), torch.as_tensor(np.asarray(pure))
 
     def regularizer(self, x_samples: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
         """``alpha sum_j E|R_S-j|`` on the policies' states, and Equation 4 where there are weights."""
@@ -77,23 +79,14 @@ class MSRD(AIRL):
             )
         return loss
 
-    def settle(self) -> int:
-        """Update rewards on the samples at hand until each ranks its own demonstration first; how many
-        updates it took.
+    def settle(self) -> None:
+        """A fixed number of further updates on the samples at hand, where there is something to discriminate.
 
-        Asks only which demonstrations belong to which strategy: simulates nothing, and leaves policies and
-        R_Task alone.
+        Strategy rewards learn; policies and R_Task rest, and nothing is simulated. Recognition is never
+        asked: a number must not be its own stopping rule.
         """
         self.rewards.task_reward.requires_grad_(False)
-        update, most = 0, self.settings.between_class_extra if self.between is not None and self.replay else 0
-        while update < most and not self.recognized().all():
+        for update in range(self.settings.between_class_extra if self.between is not None else 0):
             self._discriminate([*self.seed, 20, update], self._log_densities())
             self._average()
-            update += 1
         self.rewards.task_reward.requires_grad_(True)
-        return update
-
-    def recognized(self) -> np.ndarray:
-        """Which (averaged) strategy rewards rank their pure demonstration first among all, (M,) bool."""
-        assert self.between is not None
-        return recognized(self.averaged_rewards.mean_rewards(self.everyone), self.between[2].numpy())

@@ -4,13 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import null_space
 from scipy.optimize import minimize, nnls
 
 from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.domains.domain import Seed, extend
 from dmsrd_lite.learning.networks import Actor, Policies, one_thread
-from dmsrd_lite.method.divergence import policy_divergences
+from dmsrd_lite.method.divergence import Measure, demonstration_divergence, policy_divergences
 
 
 def check_weights(weights: ArrayLike, n_strategies: int) -> np.ndarray:
@@ -56,6 +57,7 @@ class MixtureSettings:
     search_rollouts: int = 2  # per candidate, to choose the finalists
     n_finalists: int = 6
     final_rollouts: int = 10  # of the protocol (``policy_divergences``)
+    common: bool = False  # all candidates meet the same starts and the same noise (common random numbers)
     from_actions: bool = (
         False  # try ``likeliest_weights`` first; near enough, they save the search (beyond the paper)
     )
@@ -123,6 +125,67 @@ def likeliest_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarr
     return weights / weights.sum()
 
 
+def weight_deviations(actor: Actor, demonstration: DemonstrationSet, weights: ArrayLike) -> np.ndarray:
+    """How well actions could tell the weights at best: the Cramer-Rao bound of their deviations, (M,).
+
+    ``I = sum_t Delta(s_t) Delta(s_t)^T / sigma_w^2`` with ``Delta_j = mu_j - sum_k w_k mu_k``: weights move
+    within the simplex, ``sum_j d_j = 0``. Where two people act alike everywhere it is huge: nobody can say
+    whose share it is. It holds for known means; those of learned policies are wrong by more.
+    """
+    w = check_weights(weights, actor.n_strategies)[0]
+    _, mu, sigma = (x.astype(np.float64) for x in inside_bounds(actor, demonstration))
+    scaled = (mu - w @ mu) / (w @ sigma)  # (M, N)
+    along = null_space(np.ones((1, len(w))))  # (M, M - 1): directions within the simplex
+    information = along.T @ (scaled @ scaled.T) @ along
+    values, directions = np.linalg.eigh(information)
+    spread = (along @ directions) / np.sqrt(np.maximum(values, 1e-12 * values.max()))  # (M, M - 1)
+    return np.sqrt((spread**2).sum(1))
+
+
+class Search:
+    """What every search over weights does: measure candidates, and choose the best in the end."""
+
+    def __init__(
+        self,
+        actor: Actor,
+        demonstration: DemonstrationSet,
+        settings: MixtureSettings,
+        seed: Seed,
+        measure: Measure = demonstration_divergence,
+    ):
+        self.actor, self.demonstration, self.settings, self.seed = actor, demonstration, settings, seed
+        self.of, self.steps = measure, 0
+        if (n := demonstration.n_demonstrations) != 1:
+            text = f"a mixture is searched for one demonstration at a time; expected a set of 1, not {n}"
+            raise InputError(text)
+        if (name := actor.domain.name) != demonstration.domain.name:
+            text = f"a mixture of policies of {name} cannot explain a demonstration of"
+            raise InputError(f"{text} {demonstration.domain.name}; expected one domain")
+
+    def measure(self, weights: np.ndarray, part: int, n_rollouts: int) -> np.ndarray:
+        """Divergences (K,) of mixtures (K, M) by so many rollouts; ``part`` of the seed."""
+        self.steps += len(weights) * n_rollouts * self.demonstration.horizon
+        return policy_divergences(
+            Mixtures(self.actor, weights),
+            self.demonstration,
+            extend(self.seed, part),
+            n_rollouts=n_rollouts,
+            common=self.settings.common,
+            measure=self.of,
+        )
+
+    def best(
+        self, candidates: np.ndarray, divergences: np.ndarray, always: tuple[int, ...] = ()
+    ) -> MixtureFit:
+        """The finalists measured by the protocol of every KL here, and the winner once more on rollouts of
+        its own, because the least of several noisy numbers is too low."""
+        s = self.settings
+        finalists = np.union1d(np.argsort(divergences, kind="stable")[: s.n_finalists], always).astype(int)
+        chosen = candidates[finalists[self.measure(candidates[finalists], 3, s.final_rollouts).argmin()]]
+        divergence = float(self.measure(chosen[None], 4, s.final_rollouts)[0])
+        return MixtureFit(chosen, divergence, candidates, divergences, self.steps)
+
+
 def search_mixture(
     actor: Actor,
     demonstration: DemonstrationSet,
@@ -131,22 +194,17 @@ def search_mixture(
     *,
     incumbent: ArrayLike | None = None,
     enough: float = 0.0,
+    measure: Measure = demonstration_divergence,
 ) -> MixtureFit:
     """Random search on the simplex for the mixture whose rollouts are nearest to one demonstration (a set of
     one).
 
     Equation 3. Candidates: the pure strategies, the incumbent, Dirichlet(1) draws, half of them cut down to
-    two or three strategies, then refinements around the best; each round is one batch of rollouts. The
-    finalists are measured by the protocol of every KL here, and the winner once more on rollouts of its own,
-    because the least of several noisy numbers is too low. With ``from_actions`` ``likeliest_weights`` are
-    measured first, and taken if they come below ``enough`` nats.
+    two or three strategies, then refinements around the best; each round is one batch of rollouts. With
+    ``from_actions`` ``likeliest_weights`` are measured first, and taken if they come below ``enough`` nats.
     """
     m, s, rng = actor.n_strategies, settings, np.random.default_rng(seed)
-    if demonstration.n_demonstrations != 1:
-        n = demonstration.n_demonstrations
-        raise InputError(
-            f"a mixture is searched for one demonstration at a time; expected a set of 1, not {n}"
-        )
+    search = Search(actor, demonstration, settings, seed, measure)
     drawn = rng.dirichlet(np.ones(m), s.n_candidates)
     for row in drawn[::2]:  # half of them are sparse: few strategies in a mixture are the common case
         kept = rng.permutation(m)[: 2 + rng.integers(2)]
@@ -154,29 +212,15 @@ def search_mixture(
     drawn /= drawn.sum(1, keepdims=True)
     given = np.eye(m) if incumbent is None else np.vstack([np.eye(m), check_weights(incumbent, m)[:1]])
     candidates = np.vstack([given, drawn]) if m > 1 else given
-    steps = 0
-
-    def measure(weights: np.ndarray, part: int, n_rollouts: int) -> np.ndarray:
-        nonlocal steps
-        steps += len(weights) * n_rollouts * demonstration.horizon
-        mixtures = Mixtures(actor, weights)
-        return policy_divergences(mixtures, demonstration, extend(seed, part), n_rollouts=n_rollouts)
-
     if s.from_actions and m > 1:
         likeliest = likeliest_weights(actor, demonstration)[None]
-        divergences = measure(likeliest, 5, s.final_rollouts)
+        divergences = search.measure(likeliest, 5, s.final_rollouts)
         if divergences[0] < enough:
-            return MixtureFit(likeliest[0], float(divergences[0]), likeliest, divergences, steps)
+            return MixtureFit(likeliest[0], float(divergences[0]), likeliest, divergences, search.steps)
         candidates = np.vstack([candidates, likeliest])
-    divergences = measure(candidates, 1, s.search_rollouts)
+    divergences = search.measure(candidates, 1, s.search_rollouts)
     if m > 1 and s.n_refinements:
         around = rng.dirichlet(s.concentration * candidates[divergences.argmin()] + 0.1, s.n_refinements)
-        divergences = np.append(divergences, measure(around, 2, s.search_rollouts))
+        divergences = np.append(divergences, search.measure(around, 2, s.search_rollouts))
         candidates = np.vstack([candidates, around])
-    finalists = np.argsort(divergences, kind="stable")[: s.n_finalists]
-    if incumbent is not None:
-        finalists = np.union1d(finalists, [m])
-    best = candidates[finalists[measure(candidates[finalists], 3, s.final_rollouts).argmin()]]
-    return MixtureFit(
-        best, float(measure(best[None], 4, s.final_rollouts)[0]), candidates, divergences, steps
-    )
+    return search.best(candidates, divergences, () if incumbent is None else (m,))

@@ -64,8 +64,8 @@ class Rewards(torch.nn.Module):
         return torch.cat(values, 1).numpy().reshape(m, *observations.shape[:-1])
 
     def mean_rewards(self, demonstrations: DemonstrationSet) -> np.ndarray:
-        """``eta_S-j(tau_i)``, the mean of g_j over the states of demonstration i: (M, n)."""
-        return self.evaluate(demonstrations.observations).mean((2, 3))
+        """``eta_S-j(tau_i)``, the mean of g_j over demonstration i's states that tell who acts: (M, n)."""
+        return _mean_over_telling(self, demonstrations)
 
 
 class MeanRewards(torch.nn.Module):
@@ -82,4 +82,10 @@ class MeanRewards(torch.nn.Module):
 
     def mean_rewards(self, demonstrations: DemonstrationSet) -> np.ndarray:
         """As ``Rewards.mean_rewards``."""
-        return self.evaluate(demonstrations.observations).mean((2, 3))
+        return _mean_over_telling(self, demonstrations)
+
+
+def _mean_over_telling(rewards: Rewards | MeanRewards, demonstrations: DemonstrationSet) -> np.ndarray:
+    tells = demonstrations.domain.tells(demonstrations.observations)  # (n, k, T+1)
+    values = rewards.evaluate(demonstrations.observations)  # (M, n, k, T+1)
+    return (values * tells).sum((2, 3)) / tells.sum((1, 2))

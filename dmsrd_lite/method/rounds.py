@@ -5,9 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dmsrd_lite.learning.rollouts import rollout
+from dmsrd_lite.method.between_class_discrimination import states_of
 from dmsrd_lite.method.msrd import MSRD
 from dmsrd_lite.method.policy_mixture import search_mixture
 from dmsrd_lite.method.state import State
+
+N_STATES = 3000  # of each person, for Equation 4
 
 if TYPE_CHECKING:
     from dmsrd_lite.method.dmsrd import DMSRDSettings
@@ -27,7 +31,7 @@ def play_round(
     some = remembered(state, s.remembered, [*seed, 6])
     thresholds = np.array([*(r["threshold"] for r in state.records), threshold])[some]
     moving = s.policies_after_mixture or created  # else policies rest, and nobody's KL can change
-    steps = {"search": 0, "msrd": 0}
+    steps = {"search": 0, "msrd": 0, "between_class": 0}
     searched: dict[int, list[float]] = {}
 
     def measure() -> np.ndarray:
@@ -35,8 +39,10 @@ def play_round(
 
     before = after = measure()
     if len(pure) > 1:
-        shown = state.shown.select(some), state.weights[some], np.searchsorted(some, pure)
-        between = shown if s.between_class else None
+        between = None
+        if s.between_class == "always" or (s.between_class == "mixtures" and not created):
+            states, steps["between_class"] = _states(state, some, s, [*seed, 7])
+            between = states, state.weights[some], np.searchsorted(some, pure)
         only = state.shown.select(pure)
         learner = MSRD(only, s.msrd, [*seed, 4], networks=state.networks, between=between)
         learner.n_averaged = s.msrd.n_iterations * sum(r["n_strategies"] > 1 for r in state.records)
@@ -44,9 +50,10 @@ def play_round(
         for _ in learner.train():
             pass
         learner.settle()
-        state, steps["msrd"] = replace(state, networks=learner.networks()), learner.steps * len(pure)
+        state, steps["msrd"] = (replace(state, networks=learner.networks()), learner.steps * len(pure))
         after, weights, policies = measure(), state.weights.copy(), state.policies().actor()
-        for k in np.flatnonzero(after > thresholds[: len(after)]):  # its own strategies have moved away
+        risen = np.flatnonzero(after > thresholds[: len(after)])  # its own strategies have moved away
+        for k in risen if s.search_again else ():
             if (i := int(some[k])) not in {*pure, newest}:
                 keywords = {"incumbent": weights[i], "enough": thresholds[k]}
                 fit = search_mixture(policies, state.shown.select([i]), s.mixture, [*seed, 5, i], **keywords)
@@ -60,6 +67,21 @@ def play_round(
         "searched_again": searched,
     }
     return state, {**known, "recognized": state.recognized(some)}, steps
+
+
+def _states(
+    state: State, some: np.ndarray, settings: "DMSRDSettings", seed: list[int]
+) -> tuple[np.ndarray, int]:
+    """States of the people ``some`` for Equation 4, and the environment steps that they took.
+
+    Of what they showed; or (``own_rollouts``) of what explains them, acting from new starts: what was shown
+    started in three places, and these are what is learned otherwise.
+    """
+    observations, steps = state.shown.select(some).observations, 0
+    if settings.own_rollouts:
+        data = rollout(state.domain, state.mixtures(some), settings.own_rollouts, [*seed, 0])
+        observations, steps = data.observations, data.n_steps
+    return states_of(state.domain, observations, N_STATES, [*seed, 1]), steps
 
 
 def remembered(state: State, n: int, seed: list[int]) -> np.ndarray:

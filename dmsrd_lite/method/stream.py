@@ -14,7 +14,7 @@ from dmsrd_lite.learning.networks import under
 from dmsrd_lite.method.dmsrd import DMSRDSettings, learn
 from dmsrd_lite.method.state import State
 
-_FORMAT, _VERSION = "dmsrd_lite state", 2
+_FORMAT, _VERSION = "dmsrd_lite state", 3
 
 
 def save_state(path: str | Path, state: State) -> Path:
@@ -26,7 +26,7 @@ def save_state(path: str | Path, state: State) -> Path:
     tensors |= {f"networks.{k}": v.contiguous() for k, v in state.networks.items()}
     tensors["weights"] = torch.from_numpy(state.weights)
     header = {"format": _FORMAT, "version": _VERSION, "domain": state.domain.name, "seed": state.seed,
-              "pure": state.pure, "records": state.records, "alpha": state.alpha,
+              "pure": state.pure, "records": state.records, "alpha": state.alpha, "form": state.form,
               "metadata": state.shown.metadata if known else {}}  # fmt: skip
     binary = save(tensors, metadata={k: json.dumps(plain(v)) for k, v in header.items()})
     return write_atomically(path, lambda file: file.write(binary))
@@ -45,7 +45,8 @@ def load_state(path: str | Path, domain: Domain) -> State:
     known = DemonstrationSet(domain, **shown, metadata=header["metadata"]) if shown else None
     pure, records, weights = tuple(header["pure"]), tuple(header["records"]), tensors["weights"].numpy()
     networks = under("networks", tensors)
-    return State(domain, header["seed"], known, weights, pure, networks, records, header["alpha"])
+    alpha, form = header["alpha"], header["form"]
+    return State(domain, header["seed"], known, weights, pure, networks, records, alpha, form)
 
 
 def learn_stream(

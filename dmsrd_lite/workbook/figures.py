@@ -8,6 +8,7 @@ import numpy as np
 import seaborn
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from dmsrd_lite.domains import Domain
 from dmsrd_lite.domains.domain import Drawing, InputError
@@ -172,9 +173,16 @@ def plot_weights(weights: np.ndarray, ax: Axes | None = None, labels: Sequence[o
 
 
 def plot_decisions(records: Sequence[dict], floor: np.ndarray, ax: Axes | None = None) -> Axes:
-    """KL of the best mixture and of the new policy for each demonstration (records of DMSRD)."""
+    """KL of the best mixture and of the new policy for each demonstration (records of DMSRD), on the colour
+    of the branch that was taken."""
     ax = ax or plt.gca()
     x = np.arange(len(records))
+    branches = ((MIXTURE, "mixture", 0), (BETTER_MIXTURE, "better mixture", 2), (NEW_STRATEGY, "new", 1))
+    for branch, label, k in branches:
+        taken = [i for i, r in enumerate(records) if r["branch"] == branch]
+        for i in taken:
+            name = f"taken: {label}" if i == taken[0] else None
+            ax.axvspan(i - 0.5, i + 0.5, color=INKS[k], alpha=0.15, linewidth=0, zorder=0, label=name)
     for name, key, k in (("best mixture", "kl_mix", 0), ("new policy", "kl_new", 1)):
         values = [np.nan if r[key] is None else max(r[key], 0.01) for r in records]
         ax.plot(x, values, "oX"[k], color=INKS[k], label=name, linestyle="none")
@@ -183,7 +191,10 @@ def plot_decisions(records: Sequence[dict], floor: np.ndarray, ax: Axes | None =
     ticks = [f"{i}\n({r['n_strategies']})" for i, r in enumerate(records)]
     ax.set(ylabel="KL (nats)", yscale="log", xticks=x, xticklabels=ticks)
     ax.set_xlabel("demonstration, in order of arrival (strategies so far)")
-    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4)
+    ax.set_xlim(-0.5, len(records) - 0.5)
+    ax.yaxis.set_major_formatter(ScalarFormatter())
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=8)
     return ax
 
 

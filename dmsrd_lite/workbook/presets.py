@@ -50,8 +50,10 @@ TEST_SETS = {name: _for_test_sets(usual) for name, usual in DEMONSTRATORS.items(
 
 # The search for a mixture (Equation 3): candidates, then refinements around the best of them.
 MIXTURE = {PENDULUM: MixtureSettings(64, 32), LANDER: MixtureSettings(64, 32)}
+_OURS = {name: replace(usual, from_actions=True) for name, usual in MIXTURE.items()}  # lesson 04 says why
 QUICK_MIXTURE = MixtureSettings(24, 16, n_finalists=5)
 
+_DRIFT = ((1.0, 0.5), (1.0, 1.0), (1.0, 2.0))  # rollouts of the untrained policy that lean to one side
 # AIRL and MSRD from nothing: what makes them learn stands in lesson 02.
 _FROM_NOTHING: dict[str, dict[str, Any]] = {
     PENDULUM: {
@@ -59,20 +61,27 @@ _FROM_NOTHING: dict[str, dict[str, Any]] = {
         "last_rate": 0.1, "ppo": PPOSettings(epochs=4),
     },
     LANDER: {
-        "n_iterations": 100, "episodes": 8, "first_sigma": 0.5, "coverage": "once", "replay_iterations": 0,
-        "coverage_levels": ((1.0, 0.5), (1.0, 1.0), (1.0, 2.0)), "policy_average": 0.8,
+        "n_iterations": 200, "episodes": 8, "first_sigma": 0.5, "coverage": "none", "replay_iterations": 0,
+        "coverage_levels": _DRIFT, "policy_average": 0.8,
         "ppo": PPOSettings(epochs=4, minibatch=500),
     },
 }  # fmt: skip
-_LIVE: dict[str, dict[str, Any]] = {PENDULUM: {"n_iterations": 100}, LANDER: {"episodes": 10}}
+_LIVE: dict[str, dict[str, Any]] = {
+    PENDULUM: {"n_iterations": 100},
+    LANDER: {"n_iterations": 100, "episodes": 10},
+}
+# What many share must say what failure looks like, too: drifting rollouts in the replay, or samples of all.
 _MSRD_FROM_NOTHING: dict[str, dict[str, Any]] = {
     PENDULUM: {"n_iterations": 135},
-    LANDER: {"n_iterations": 160, "episodes": 6},
+    LANDER: {"n_iterations": 160, "episodes": 6, "coverage": "once"},
 }
 _BATCH_FROM_NOTHING: dict[str, dict[str, Any]] = {
-    PENDULUM: {"n_iterations": 140, "discriminator_steps": 36, "last_rate": 1.0},
+    PENDULUM: {
+        "n_iterations": 140, "discriminator_steps": 36, "last_rate": 1.0, "replay_iterations": 0,
+        "grow_below": 0.9,  # one policy for ten people is always seen through a little
+    },
     LANDER: {
-        "n_iterations": 130, "episodes": 16, "discriminator_steps": 36,
+        "n_iterations": 130, "episodes": 16, "discriminator_steps": 36, "iterates_share": 1.0,
         "entropy_weight": 0.0, "entropy_tuning": 0.0,  # no c suits one policy for ten people
     },
 }  # fmt: skip
@@ -90,16 +99,32 @@ def from_nothing(domain: str, settings: AIRLSettings, **changes: Any) -> Any:
 # The methods of the comparison. Lander: as many updates of R_Task as DMSRD makes in all; more make it worse.
 _LANDER_ROUND = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=6)
 METHODS = {
-    PENDULUM: MethodSettings(dmsrd=DMSRDSettings(mixture=MIXTURE[PENDULUM])),
+    PENDULUM: MethodSettings(dmsrd=DMSRDSettings(mixture=_OURS[PENDULUM])),
     LANDER: MethodSettings(
         msrd=MSRDSettings(n_iterations=25, discriminator_steps=10),
         batch=AIRLSettings(n_iterations=25, discriminator_steps=10),
-        dmsrd=DMSRDSettings(kl_margin=1.0, msrd=_LANDER_ROUND, mixture=MIXTURE[LANDER]),
+        dmsrd=DMSRDSettings(kl_margin=1.0, msrd=_LANDER_ROUND, mixture=_OURS[LANDER]),
     ),
 }
+_DMSRD_FROM_NOTHING = {PENDULUM: 130, LANDER: 110}  # iterations of AIRL on a new strategy
+
+
+def _round_from_nothing(domain: str, usual: MSRDSettings) -> MSRDSettings:
+    """Whole episodes, at the rate that AIRL ended with."""
+    ppo = replace(_FROM_NOTHING[domain]["ppo"], learning_rate=1e-4)
+    changes = {"first_horizon": 0, "coverage": "none", "policy_average": 0.0, "n_iterates": 0, "ppo": ppo}
+    changes |= {"n_iterations": usual.n_iterations, "episodes": usual.episodes, "last_rate": 1.0}
+    return from_nothing(domain, usual, **changes)
+
+
 METHODS_FROM_NOTHING = {
     name: replace(
         usual,
+        dmsrd=replace(
+            usual.dmsrd,
+            airl=from_nothing(name, AIRLSettings(), n_iterations=_DMSRD_FROM_NOTHING[name]),
+            msrd=_round_from_nothing(name, usual.dmsrd.msrd),
+        ),
         airl=from_nothing(name, AIRLSettings()),
         msrd=from_nothing(name, MSRDSettings(), **_MSRD_FROM_NOTHING[name]),
         batch=from_nothing(name, AIRLSettings(), **_BATCH_FROM_NOTHING[name]),
@@ -129,11 +154,26 @@ class AIRLLesson:  # 02
     fit_steps: int  # of the reward fitted to true returns
     few: tuple[int, ...]  # people on whom ingredients are taken away
     person: int = 1
+    ablated_seed: int = 0  # only with this one ingredients are taken away, too: half an hour
 
     @property
     def methods(self) -> dict[str, MethodSettings]:
         """By start."""
         return {"clone": METHODS[self.domain], "nothing": METHODS_FROM_NOTHING[self.domain]}
+
+    @property
+    def ingredients(self) -> dict[str, AIRLSettings]:
+        """Of what AIRL Batch's frozen reward is made of, each time without one thing."""
+        usual = self.methods["nothing"].batch
+        changes: dict[str, dict[str, Any]] = {
+            "no penalty": {"penalty_weight": 0.0},
+            "samples of ten iterations": {"replay_iterations": 10},
+        }
+        if usual.coverage == "once":
+            changes["no drifting rollouts"] = {"coverage": "none"}
+        else:
+            changes["drifting rollouts"] = {"coverage": "once", "coverage_levels": _DRIFT}
+        return {name: replace(usual, **change) for name, change in changes.items()}
 
     @property
     def variants(self) -> dict[str, AIRLSettings]:
@@ -143,7 +183,7 @@ class AIRLLesson:  # 02
         if usual.first_horizon:
             without["whole episodes"] = {"first_horizon": 0}
         else:
-            without["no drifting rollouts"] = {"coverage": "none"}
+            without["drifting rollouts"] = {"coverage": "once"}
         paid: dict[str, dict[str, Any]] = {
             "paid g": {"entropy_weight": 0.0, "entropy_tuning": 0.0},
             "paid g - 0.05 log pi": {"entropy_tuning": 0.0},
@@ -177,7 +217,14 @@ class MixtureLesson:  # 04
     parents: tuple[int, int]
     share: float  # of the first parent in the mixture that is to be found back
     search: MixtureSettings
+    triangle: tuple[int, int, int]  # three people ...
+    study: MixtureSettings  # searches side by side: full searches of Equation 3 ...
     cloning_steps: int = 1000
+    inside: tuple[float, float, float] = (0.4, 0.3, 0.3)  # ... and somebody who mixes them
+    n_newcomers: int = 20
+    n_known: tuple[int, ...] = (2, 5, 9)
+    budgets: tuple[int, ...] = (12, 24, 48, 96)  # candidates
+    identifiable: float = 0.02  # Cramer-Rao bound of a weight
 
     @property
     def true_weights(self) -> tuple[float, float]:
@@ -189,26 +236,58 @@ class DiscriminationLesson:  # 05
     users: tuple[int, ...]
     n_mixtures: int
     msrd: MSRDSettings
-    cloning_steps: int = 1000  # of the stand-ins that mixtures are made of
+    n_own: int  # rollouts from new starts on which Equation 4 is asked
+    n_fresh: tuple[int, ...] = (3, 10, 30)  # fresh takes on which recognition is measured
+    n_states: int = 3000  # of each person
 
     @property
     def as_printed(self) -> MSRDSettings:
         """Equation 4 as it stands."""
         return replace(self.msrd, between_class_relative=False)
 
+    @property
+    def ablations(self) -> dict[str, tuple[MSRDSettings, int]]:
+        """Fewer rollouts from new starts; AIRL's penalty; no further updates after training."""
+        return {
+            "new starts, 3 rollouts": (self.msrd, 3),
+            "new starts, 10 rollouts": (self.msrd, 10),
+            "new starts, with penalty": (replace(self.msrd, penalty_weight=1.0), self.n_own),
+            "new starts, no further updates": (replace(self.msrd, between_class_extra=0), self.n_own),
+        }
+
 
 @dataclass(frozen=True)
 class DMSRDLesson:  # 06
+    domain: str
     users: tuple[int, ...]
     mixtures: tuple[tuple[float, ...], ...]  # users who arrive after them: weights of ``users``
-    later: tuple[tuple[int, int], ...]  # and after these: half-and-half mixtures of two
-    methods: MethodSettings
+    loop: DMSRDSettings  # ours, from a clone
     fresh: TrainingSettings  # policies on the frozen task reward
-    cloning_steps: int = 1000  # of the stand-ins that mixtures are made of
+    n_fresh: tuple[int, ...] = (3, 10, 30)  # fresh takes on which recognition is measured
+    n_known: int = 5  # the rule for eps: so many are known ...
+    n_decisions: int = 20  # ... and so many people of a new kind, and as many mixtures, arrive
+    margins: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # eps above its reference (nats)
+
+    @property
+    def forms(self) -> dict[str, DMSRDSettings]:
+        """Algorithm 1 as printed and ours, from both starts."""
+        starts = {"clone": self.loop, "nothing": METHODS_FROM_NOTHING[self.domain].dmsrd}
+        forms = {f"ours, {start}": loop for start, loop in starts.items()}
+        return forms | {f"as printed, {start}": loop.as_printed() for start, loop in starts.items()}
+
+    @property
+    def ablations(self) -> dict[str, DMSRDSettings]:
+        """Ours from a clone, with one deviation from the paper taken back at a time."""
+        printed = self.loop.as_printed()
+        names = "add_task_reward", "between_class", "own_rollouts", "search_again"
+        found = {f"{name} as printed": replace(self.loop, **{name: getattr(printed, name)}) for name in names}
+        by_states = replace(self.loop, mixture=replace(self.loop.mixture, from_actions=False))
+        found["from_actions as printed"] = by_states
+        return found | {"without BCD": replace(self.loop, between_class="never")}
 
     @property
     def generous(self) -> DMSRDSettings:
-        return replace(self.methods.dmsrd, kl_threshold=1000.0)
+        return replace(self.loop, kl_threshold=1000.0)
 
 
 @dataclass(frozen=True)
@@ -252,18 +331,22 @@ def _lifelong(domain: str, quick: bool) -> LifelongLesson:
 
 
 def _dmsrd(domain: str, quick: bool) -> DMSRDLesson:
-    methods, fresh = METHODS[domain], replace(TRAINING[domain], hold=0.5, growing=0.9)
+    loop = METHODS[domain].dmsrd
     if not quick:
-        return DMSRDLesson(tuple(range(10)), (), ((0, 1), (2, 3), (3, 5)), methods, fresh)
+        halves = tuple(tuple((i in pair) / 2 for i in range(10)) for pair in ((0, 1), (2, 3), (3, 5)))
+        return DMSRDLesson(domain, tuple(range(10)), halves, loop, _fresh(domain))
     airl = AIRLSettings(n_iterations=4, episodes=4, cloning_steps=1000, coverage_episodes=1)
-    msrd = replace(methods.dmsrd.msrd, n_iterations=3, episodes=2, discriminator_steps=24)
-    loop = replace(methods.dmsrd, airl=airl, msrd=msrd, mixture=MixtureSettings(12, 8, n_finalists=3))
-    return DMSRDLesson((0, 1, 2), ((0.5, 0.5, 0.0), (0.3, 0.0, 0.7)), (), replace(methods, dmsrd=loop), fresh)
+    msrd = replace(loop.msrd, n_iterations=3, episodes=2, discriminator_steps=24)
+    mixture = MixtureSettings(12, 8, n_finalists=3, from_actions=True)
+    loop = replace(loop, airl=airl, msrd=msrd, mixture=mixture, own_rollouts=5)
+    return DMSRDLesson(domain, (0, 1, 3), ((0.5, 0.5, 0.0), (0.3, 0.0, 0.7)), loop, _fresh(domain))
 
 
 def _fresh(domain: str) -> TrainingSettings:
-    n = 10 if domain == PENDULUM else 5
-    return replace(TRAINING[domain], n_strategies=n, n_iterations=120, hold=0.5, growing=0.9)
+    """Long, and slower towards the end: too short a training looks like a reward that does not teach."""
+    if domain == LANDER:
+        return replace(TRAINING[domain], n_strategies=5, n_iterations=120, hold=0.5, growing=0.9)
+    return TrainingSettings(n_strategies=10, n_iterations=240, hold=0.75, growing=0.92, last_rate=0.1)
 
 
 def _airl(domain: str, quick: bool) -> AIRLLesson:
@@ -290,10 +373,12 @@ LESSONS: dict[str, Any] = {  # (domain, quick) -> settings
     "03_msrd": lambda domain, quick: MSRDLesson(domain, (0, 1, 2), MSRDSettings(
         n_iterations=9 if quick else 25, discriminator_steps=24, **_small(quick, 8)), _fresh(domain)),
     "04_policy_mixture": lambda domain, quick: MixtureLesson(
-        (4, 8) if domain == PENDULUM else (0, 1), 0.5, QUICK_MIXTURE if quick else MIXTURE[domain]),
+        (4, 8) if domain == PENDULUM else (0, 1), 0.5, QUICK_MIXTURE if quick else MIXTURE[domain],
+        (4, 1, 3) if domain == PENDULUM else (2, 0, 1), MIXTURE[domain], 1000 if quick else 3000),
     "05_between_class_discrimination": lambda domain, quick: DiscriminationLesson(
         _users(quick), 2 if quick else 5,
-        MSRDSettings(n_iterations=9 if quick else 20, discriminator_steps=24, **_small(quick, 4))),
+        MSRDSettings(n_iterations=9 if quick else 20, discriminator_steps=24, **_small(quick, 4)),
+        {True: 10, False: 20 if domain == PENDULUM else 40}[quick]),
     "06_dmsrd": _dmsrd,
     "08_lifelong_100": _lifelong,
 }  # fmt: skip
@@ -317,7 +402,7 @@ KNOBS: dict[str, dict[str, Knob]] = {
     "05_between_class_discrimination": {
         "between_class_weight": Knob("msrd.between_class_weight", 0, 1e6, 10.0),
         "n_iterations": Knob("msrd.n_iterations", 1, 10_000)},
-    "06_dmsrd": {"kl_threshold": Knob("methods.dmsrd.kl_threshold", 1e-6, 1e9)},
+    "06_dmsrd": {"kl_threshold": Knob("loop.kl_threshold", 1e-6, 1e9)},
     "08_lifelong_100": {"users": Knob("users", 10, 100), "remembered": Knob("loop.remembered", 0, 100, 10),
                         "moving": Knob("loop.policies_after_mixture", 0, 1, False)},
 }  # fmt: skip

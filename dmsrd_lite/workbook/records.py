@@ -28,6 +28,7 @@ DECIDING = (
     "learning",
     "demonstrations.py",
     "method",
+    "beyond",
     "evaluation",
     "demonstrators",
     "workbook/presets.py",
@@ -74,6 +75,14 @@ def _code(text: str) -> str:
 def settings_of(settings: Any) -> Any:
     """Settings as they stand in a record: names and plain values."""
     return plain(dataclasses.asdict(settings))
+
+
+def recorded(name: str) -> dict:
+    """The results of a record; nothing, and one line that says so, where it is not there yet."""
+    if not (RECORDS / f"{name}.json").exists():
+        print(f"no record {name} yet; a run with preset=full, record=True writes it")
+        return {}
+    return load_record(name)[0]["results"]
 
 
 def save_record(

@@ -25,7 +25,11 @@ SHOWN = {
     "spearman": "Spearman",
     "spearman_of_good": "Spearman among those that do not fail",
     "steps": "steps in all",
+    "recognized_on_shown": "recognised on what was shown (share)",
+    **{f"recognized_on_{k}": f"on {k} fresh takes" for k in (3, 10, 30)},
+    "weight_error": "error of the weights",
 }
+NO_METRICS = ("curve", "curves", "decisions", "branches", "pure")
 COLUMNS = ("record", "lesson", "domain", "seed", "method", "metric", "value")
 
 
@@ -55,14 +59,24 @@ def numbers() -> Iterator[tuple]:
 def _numbers(record: dict, domain: Domain) -> Iterator[tuple[str, str, Any]]:
     """Method, metric, and value or values, of a record's results."""
     r, few = record["results"], record["settings"].get("few")
+    if "rows" in r:
+        yield from _searches(r["rows"])
+        return
+    if "n_fresh" in r:
+        yield from _recognition(r["table"])
+        return
     floor, own = np.array(r["floor"]), np.array(r["own_log_likelihood"])
     yield "demonstrator", "divergence", floor
     yield "demonstrator", "log_likelihood_per_step", own
     for method, scores in r["table"].items():
         yield from _scores(method, scores, domain, floor, own)
+    for name, scores in r.get("ablations", {}).items():
+        yield from _scores(f"ours, clone: {name}", scores, domain, floor, own)
     for name, scores in r.get("variants", {}).items():
         yield from _scores(f"variant: {name}", scores, domain, floor[few], own[few])
     for name, scores in r.get("worth", {}).items():
+        yield from _scores(f"fresh policies on: {name}", scores, domain, None, None)
+    for name, scores in r.get("ingredients", {}).items():
         yield from _scores(f"fresh policies on: {name}", scores, domain, None, None)
     for name, found in r.get("correlations", {}).items():
         yield from ((f"reward: {name}", kind, value) for kind, value in found.items())
@@ -72,11 +86,36 @@ def _scores(
     method: str, scores: dict, domain: Domain, floor: np.ndarray | None, own: np.ndarray | None
 ) -> Iterator[tuple[str, str, Any]]:
     """The metrics of one row, and what follows from them."""
-    yield from ((method, metric, value) for metric, value in scores.items() if "curve" not in metric)
+    for metric, value in scores.items():
+        if metric == "recognized_fresh":
+            yield from (
+                (method, f"recognized_on_{take}", n / len(scores["pure"])) for take, n in value.items()
+            )
+        elif metric not in NO_METRICS:
+            yield method, metric, value
     yield method, "able", able(domain, scores)
     if floor is not None and own is not None:
         yield method, "divergence_above_floor", np.subtract(scores["divergence"], floor)
         yield method, "log_likelihood_above_own", np.subtract(scores["log_likelihood_per_step"], own)
+
+
+def _searches(rows: list[dict]) -> Iterator[tuple[str, str, Any]]:
+    """Lesson 04: where each search ended, by the number of known people."""
+    table = pd.DataFrame(rows)
+    last = table[(table["budget"] == table["budget"].max()) | (table["budget"] == 0)]
+    for (known, search), found in last.groupby(["known", "search"], sort=False):
+        method = f"{search}, {known} known"
+        yield method, "divergence_above_floor", found["above_floor"]
+        yield method, "weight_error", found["error"]
+        yield method, "steps", found["steps"]
+
+
+def _recognition(table: dict[str, dict]) -> Iterator[tuple[str, str, Any]]:
+    """Lesson 05: the share of strategy rewards that know their person, and R_Task's correlation."""
+    for method, row in table.items():
+        for take, n in row["recognized"].items():
+            yield method, f"recognized_on_{take.removesuffix(' fresh')}", n / len(row["means"][take])
+        yield method, "pearson", row["task"]
 
 
 def page(table: pd.DataFrame) -> str:

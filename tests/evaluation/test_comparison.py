@@ -16,7 +16,6 @@ from dmsrd_lite.method.rewards import MeanRewards
 from dmsrd_lite.method.state import State
 
 SETTINGS = {"ours": MethodSettings(tiny.AIRL_ONE, tiny.MSRD_ONE, tiny.TINY, tiny.AIRL_ONE)}
-SETTINGS["paper"] = SETTINGS["ours"].as_in_the_paper()
 NOTHING = {
     "start": "nothing",
     "coverage": "none",
@@ -24,11 +23,9 @@ NOTHING = {
     "n_iterates": 4,
     "iterates_share": 1.0,
 }
-FROM_NOTHING = MethodSettings(
-    replace(tiny.AIRL_ONE, **NOTHING),
-    replace(tiny.MSRD_ONE, **NOTHING),
-    batch=replace(tiny.AIRL_ONE, **NOTHING),
-)
+_ALONE, _SHARED = replace(tiny.AIRL_ONE, **NOTHING), replace(tiny.MSRD_ONE, **NOTHING)
+_LOOP = replace(tiny.TINY, airl=_ALONE, msrd=replace(_SHARED, n_iterates=0))
+FROM_NOTHING = SETTINGS["nothing"] = MethodSettings(_ALONE, _SHARED, _LOOP, _ALONE)
 RUNS = [("cloning", "ours"), *((method, variant) for method in METHODS[1:] for variant in SETTINGS)]
 SCORES = ("divergence", "log_likelihood_per_step", "task_correlation", "recognized", "environment_return")
 
@@ -72,27 +69,16 @@ def test_from_nothing_the_mean_of_functions_is_learned_and_stored(method, small_
 def test_a_method_spends_what_its_settings_and_records_say(small_set):
     assert train_method("cloning", small_set, SETTINGS["ours"], 0).steps == 0
     coverage, two_iterations, two_users = 3 * 50, 2 * 50, 2
-    ours, paper = (
-        train_method("AIRL Single", small_set, settings, 0).steps for settings in SETTINGS.values()
-    )
-    assert (ours, paper) == (two_users * (coverage + two_iterations), two_users * two_iterations)
-    *_, state = learn(State(small_set.domain, 0), small_set, tiny.TINY)
+    warm, cold = (train_method("AIRL Single", small_set, SETTINGS[k], 0).steps for k in ("ours", "nothing"))
+    assert (warm, cold) == (two_users * (coverage + two_iterations), two_users * two_iterations)
+    loop = replace(tiny.TINY, own_rollouts=2)
+    *_, state = learn(State(small_set.domain, 0), small_set, loop)
     learned, spent = comparison.learned_by(state), [record["steps"] for record in state.records]
-    assert learned.steps == sum(s["airl"] + s["msrd"] for s in spent) > 0
+    assert learned.steps == sum(s["airl"] + s["msrd"] + s["between_class"] for s in spent) > 0
+    assert spent[1]["between_class"] == 2 * 2 * small_set.domain.horizon
     assert learned.search_steps == sum(s["search"] for s in spent) > 0
     assert np.array_equal(learned.weights, state.weights)
     assert (learned.task_part, learned.pure) == ("task", state.pure)
-
-
-def test_as_in_the_paper_switches_three_things_off_everywhere():
-    ours, paper = SETTINGS.values()
-    for changed, usual in ((paper, ours), (paper.dmsrd, ours.dmsrd)):
-        for part in ("airl", "msrd"):
-            settings = getattr(changed, part)
-            assert (settings.start, settings.coverage) == ("nothing", "none")
-            back = replace(settings, start="clone", coverage="half")
-            assert back == getattr(usual, part), "and nothing else"
-    assert (paper.dmsrd.add_task_reward, ours.dmsrd.add_task_reward) == (False, True)
 
 
 def test_unknown_method(small_set):

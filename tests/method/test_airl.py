@@ -314,3 +314,28 @@ def test_settings_that_cannot_be_are_one_sentence(change, sentence):
 def test_a_first_horizon_needs_a_horizon_to_grow_to(small_set):
     with pytest.raises(InputError, match=r"^first_horizon 60: expected at most the demonstrations' 50 steps"):
         AIRL(small_set, replace(AIRL_ONE, first_horizon=60), 0)
+
+
+def test_from_nothing_a_later_learner_still_sees_what_was_on_the_way(small_set, monkeypatch):
+    """An even choice of the whole replay goes on, unchanged from learner to learner, in every pool."""
+    monkeypatch.setattr(airl, "N_ANCHORS", 12)
+    settings = replace(AIRL_ONE, **AS_IN_THE_PAPER)
+    first = AIRL(small_set, settings, 0)
+    list(first.train())
+    seen = first._joined(list(first.replay))
+    networks = first.networks()
+    some = np.linspace(0, seen[0].shape[1] - 1, 12).astype(int)
+    for part, whole in zip(range(3), seen, strict=True):
+        assert torch.equal(networks[f"anchors.{part}"], whole[:, some])
+    second = AIRL(small_set, settings, 1, networks=networks)
+    pools = []
+    joined = AIRL._joined
+    monkeypatch.setattr(AIRL, "_joined", staticmethod(lambda parts: pools.append(parts) or joined(parts)))
+    list(second.train())
+    assert all(torch.equal(pool[0][0], networks["anchors.0"]) for pool in pools)
+    assert second.steps == 2 * 50, "nothing is explored anew"
+    kept = second.networks()
+    assert same(*({k: v for k, v in n.items() if k.startswith("anchors")} for n in (networks, kept)))
+    warm = AIRL(small_set, replace(AIRL_ONE, n_iterations=1), 0)
+    list(warm.train())
+    assert not any(name.startswith("anchors") for name in warm.networks()), "from a clone there is coverage"

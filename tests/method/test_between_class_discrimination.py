@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from dmsrd_lite.method.between_class_discrimination import between_class_loss, recognized, relative_to_own
+from dmsrd_lite.demonstrations import DemonstrationSet
+from dmsrd_lite.domains import INVERTED_PENDULUM, LUNAR_LANDER
+from dmsrd_lite.method.between_class_discrimination import (
+    between_class_loss,
+    recognized,
+    relative_to_own,
+    states_of,
+)
 from dmsrd_lite.method.rewards import Rewards
 
 PURE = torch.tensor([0, 3])
@@ -93,3 +100,24 @@ def test_recognized_on_tables_by_hand():
     assert answers == [[True, False], [False, True], [False, False]]
     assert recognized(np.array([[1.0, 1.0]]), [0]).tolist() == [False], "a tie"
     assert recognized(np.array([[1.0]]), [0]).tolist() == [True], "one alone"
+
+
+def test_states_that_are_everybodys_do_not_count():
+    """A lander on its legs says nothing about who acts: neither Equation 4 nor the mean reward sees it."""
+    observations = np.random.default_rng(0).normal(size=(2, 3, 6, 8))
+    observations[..., 6:] = 0
+    observations[:, :, 4:, 6] = 1  # the last two states: a leg touches
+    lander = np.full((2, 3, 6), True)
+    lander[:, :, 4:] = False
+    assert np.array_equal(LUNAR_LANDER.tells(observations), lander)
+    assert INVERTED_PENDULUM.tells(observations[..., :4]).all()
+    states = states_of(LUNAR_LANDER, observations, 50, [0])
+    assert states.shape == (2, 50, 8)
+    for person in range(2):
+        flown = {tuple(row) for row in observations[person, :, :4].reshape(-1, 8)}
+        assert {tuple(row) for row in states[person]} <= flown
+    assert len(np.unique(states[0], axis=0)) > 6, "drawn from all of them"
+    shown = DemonstrationSet(LUNAR_LANDER, observations, np.zeros((2, 3, 5, 2)))
+    rewards = Rewards(LUNAR_LANDER, 2, 0.99, 0)
+    by_hand = rewards.evaluate(observations)[..., :4].mean((2, 3))
+    assert np.allclose(rewards.mean_rewards(shown), by_hand, atol=1e-6)

@@ -46,7 +46,7 @@ def test_the_first_demonstration_makes_the_first_strategy(three, monkeypatch):
     (record,) = state.records
     assert [record[k] for k in ("branch", "kl_mix", "weights", "recognized")] == [
         "new strategy", None, [1.0], [True]]  # fmt: skip
-    assert record["steps"] == {"search": 0, "airl": 50 + 3 * 50, "msrd": 0}
+    assert record["steps"] == {"search": 0, "airl": 50 + 3 * 50, "msrd": 0, "between_class": 0}
     assert (state.weights.tolist(), state.pure, state.n_strategies) == ([[1.0]], (0,), 1)
     assert same(state.networks, made[0]["learner"].networks())
     assert not state.rewards().evaluate(three.observations, "task").any()
@@ -96,7 +96,8 @@ def test_a_rejected_airl_leaves_no_trace(three, states, monkeypatch):
 @pytest.mark.parametrize("add_task_reward", [True, False])
 def test_the_task_reward_is_added_to_what_a_new_strategy_learns(add_task_reward, three, states, monkeypatch):
     made = watch(monkeypatch, dmsrd, "AIRL")
-    after(states[2], three.select([2]), replace(ROUGH, add_task_reward=add_task_reward))
+    settings = replace(ROUGH, add_task_reward=add_task_reward)
+    after(replace(states[2], form=settings.form), three.select([2]), settings)
     known = states[2].rewards().evaluate(three.observations, "task")
     added = made[0]["learner"].rewards.evaluate(three.observations, "task")
     assert known.any()
@@ -172,6 +173,8 @@ BAD_SETTINGS = [
       for bad in (-0.1, float("nan"), float("inf"))),
     *(({name: part}, "coverage differs between airl and msrd: expected the same, because")
       for name, part in WITHOUT_COVERAGE.items()),
+    ({"airl": replace(ROUGH.airl, start="nothing")}, "start differs between airl and msrd: expected the"),
+    ({"between_class": True}, "between_class True: expected one of always, mixtures, never"),
 ]  # fmt: skip
 
 
@@ -185,10 +188,34 @@ def test_without_coverage(three, states):
     state = after(states[0], three.select([0]), replace(TINY, **WITHOUT_COVERAGE))
     assert state.networks.keys() == {name for name in states[1].networks if not name.startswith("coverage.")}
     assert state.records[0]["steps"]["airl"] == 50
+    kept = copied(state)
     with pytest.raises(
-        InputError, match=r"^coverage is 'half' in the settings, and not so in the state; exp"
+        InputError, match=r"^a state that was learned from clone, add_task_reward.* cannot go"
     ):
         after(state, three.select([1]))
+    assert same(everything(state), kept)
+
+
+def test_a_state_goes_on_in_the_form_that_made_it(three, states):
+    """Another form or another start is refused in one sentence; more memory, other rates are the same."""
+    for other in (TINY.as_printed(), replace(TINY, search_again=False)):
+        assert other.form != TINY.form
+        with pytest.raises(
+            InputError, match=f"^a state .* cannot go on {other.form}; expected the same form$"
+        ):
+            after(states[2], three.select([2]), other)
+    assert replace(TINY, remembered=3, kl_margin=2.0).form == TINY.form
+
+
+def test_as_printed_takes_every_deviation_back():
+    printed = replace(TINY, own_rollouts=5, remembered=2, policies_after_mixture=False).as_printed()
+    assert printed.form == "from clone with coverage, as printed"
+    assert (printed.between_class, printed.own_rollouts, printed.remembered) == ("mixtures", 0, 0)
+    assert printed.policies_after_mixture
+    off = printed.add_task_reward, printed.search_again, printed.mixture.from_actions
+    assert off == (False, False, False)
+    assert not printed.msrd.between_class_relative
+    assert printed.airl == TINY.airl
 
 
 def test_same_seed_same_bits_for_any_number_of_threads(three, states):

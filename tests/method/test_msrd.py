@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers import balancers, shown_by
 from tiny import AIRL_ONE, MSRD_ONE, same
 
 from dmsrd_lite.domains import InputError
@@ -29,10 +28,15 @@ def everyone(small_set):
 @pytest.fixture
 def trained(small_set, everyone):
     """After a tiny run, with a task reward that says something."""
-    learner = MSRD(small_set, MSRD_ONE, 0, between=(everyone, WEIGHTS, PURE))
+    learner = MSRD(small_set, MSRD_ONE, 0, between=(flat(everyone.observations), WEIGHTS, PURE))
     list(learner.train())
     stir(learner.rewards)
     return learner
+
+
+def flat(observations):
+    """(n, k, T+1, d) -> (n, k (T+1), d)."""
+    return observations.reshape(len(observations), -1, observations.shape[-1])
 
 
 def stir(rewards, seed=0):
@@ -98,7 +102,7 @@ def test_regularizer_by_hand(alpha, relative, small_set, everyone):
     still, places = everyone.observations.copy(), np.random.default_rng(0).normal(0, 0.4, (3, 4))
     still[:] = places[:, None, None]
     settings = replace(MSRD_ONE, alpha=alpha, between_class_weight=7.0, between_class_relative=relative)
-    learner = MSRD(small_set, settings, 0, between=(replace(everyone, observations=still), WEIGHTS, PURE))
+    learner = MSRD(small_set, settings, 0, between=(flat(still), WEIGHTS, PURE))
     stir(learner.rewards)
     g = learner.rewards.g(X).detach().numpy()
     absolute = alpha * sum(np.mean([abs(v) for v in g[j]]) for j in range(2))
@@ -147,7 +151,7 @@ def test_gradient_of_the_whole_loss_by_finite_differences(trained):
 def test_between_class_discrimination_reaches_the_strategy_rewards_only(small_set, everyone, trained):
     """The gradient with and without it: the task reward and the shaping terms feel nothing of it."""
     settings, steps = replace(MSRD_ONE, discriminator_steps=1), []
-    for between in (None, (everyone, WEIGHTS, PURE)):
+    for between in (None, (flat(everyone.observations), WEIGHTS, PURE)):
         learner = MSRD(small_set, settings, 0, networks=trained.networks(), between=between)
         learner.replay.append(trained.replay[0])
         steps.append(one_step(learner))
@@ -168,52 +172,23 @@ def test_networks_go_from_one_learner_to_the_next(small_set, trained):
     assert not same(again.networks(), networks)
 
 
-def test_recognition_is_of_the_averaged_rewards_among_all(small_set, everyone):
-    learner = MSRD(small_set, MSRD_ONE, 0, between=(everyone, WEIGHTS, PURE))
-    answers = []
-    for seed in range(6):  # many random rewards, so that both answers come up
-        stir(learner.averaged_rewards, seed)
-        means = learner.averaged_rewards.mean_rewards(everyone)
-        by_hand = [means[j].argmax() == PURE[j] for j in range(2)]
-        assert learner.recognized().tolist() == by_hand
-        answers += by_hand
-    assert set(answers) == {True, False}
-
-
-def test_settling_updates_rewards_until_all_are_recognized(monkeypatch):
-    shown = shown_by(balancers([-0.4, 0.4]), 50)
-    settings = replace(MSRD_ONE, discriminator_steps=4, reward_average=0.5)
-    learner = MSRD(shown, settings, 0, between=(shown, np.eye(2), PURE))
-    list(learner.train())
-    with torch.no_grad():  # unlearn: each strategy reward with the other's sign
-        for rewards in (learner.rewards, learner.averaged_rewards):
-            rewards.strategy_reward.weights[-1].mul_(-1)
-    assert not learner.recognized().all()
-    before, steps = learner.networks(), learner.steps
-    monkeypatch.setattr(airl, "rollout", None)  # nothing is simulated
-    updates = learner.settle()
-    assert 0 < updates < settings.between_class_extra
-    assert learner.recognized().all()
-    assert learner.n_averaged == settings.n_iterations + updates
-    assert learner.steps == steps
-    settled = learner.networks()
-    for name, tensor in settled.items():
-        if name.startswith(("policies.", "values.", "coverage.")) or ".task_reward." in name:
-            assert torch.equal(tensor, before[name]), name
-    assert learner.settle() == 0, "recognised already"
-    assert same(learner.networks(), settled)
-    assert all(p.requires_grad for p in learner.rewards.parameters()), "R_Task rested only meanwhile"
-
-
-def test_settling_has_an_end_and_needs_weights(small_set, everyone):
-    settings, twins = replace(MSRD_ONE, between_class_extra=3), everyone.select([0, 0, 0])
-    for between, updates in (((twins, WEIGHTS, PURE), 3), (None, 0)):  # of twins no reward can know its own
+def test_settling_is_so_many_updates_of_the_strategy_rewards_alone(small_set, everyone, monkeypatch):
+    settings = replace(MSRD_ONE, between_class_extra=3)
+    for between, updates in (((flat(everyone.observations), WEIGHTS, PURE), 3), (None, 0)):
         learner = MSRD(small_set, settings, 0, between=between)
         list(learner.train())
-        before = learner.networks()
-        assert learner.settle() == updates
+        before, steps = learner.networks(), learner.steps
+        with monkeypatch.context() as patch:
+            patch.setattr(airl, "rollout", None)  # nothing is simulated
+            learner.settle()
         assert learner.n_averaged == 2 + updates
-        assert same(learner.networks(), before) == (updates == 0)
+        assert learner.steps == steps
+        after = learner.networks()
+        assert same(after, before) == (updates == 0)
+        for name, tensor in after.items():
+            if name.startswith(("policies.", "values.", "coverage.", "rewards.task_reward.")):
+                assert torch.equal(tensor, before[name]), name
+        assert all(p.requires_grad for p in learner.rewards.parameters()), "R_Task rested only meanwhile"
 
 
 @pytest.mark.parametrize("alpha", [0.0, -0.1, float("nan")])

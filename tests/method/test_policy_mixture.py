@@ -8,7 +8,7 @@ from scipy.stats import kstest, norm
 from tiny import same
 
 from dmsrd_lite.demonstrations import demonstrations_from
-from dmsrd_lite.domains import INVERTED_PENDULUM, InputError
+from dmsrd_lite.domains import INVERTED_PENDULUM, LUNAR_LANDER, InputError
 from dmsrd_lite.learning.networks import Actor, GaussianPolicies
 from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method import policy_mixture
@@ -104,7 +104,7 @@ def test_the_choice_by_hand(monkeypatch):
     """Made-up divergences: the finals choose of the best and the incumbent, the winner is measured anew."""
     incumbent, seeds, finals = np.array([0.2, 0.5, 0.3]), [], []
 
-    def divergences(mixtures, demonstration, seed, *, n_rollouts):
+    def divergences(mixtures, demonstration, seed, *, n_rollouts, **_):
         seeds.append(seed)
         weights = mixtures.weights
         if len(seeds) <= 2:  # the search: the nearer to strategy 2, the better
@@ -116,12 +116,61 @@ def test_the_choice_by_hand(monkeypatch):
     monkeypatch.setattr(policy_mixture, "policy_divergences", divergences)
     fit = search_mixture(THREE, shown_by(balancers([0.0])), QUICK, 0, incumbent=incumbent)
     assert len(finals[0]) == 5
-    assert finals[0][0].tolist() == [0, 0, 1], "strategy 2 was the best of the search"
+    assert [0, 0, 1] in finals[0].tolist(), "strategy 2 was the best of the search"
     assert np.array_equal(fit.weights, incumbent)
     assert np.allclose(finals[1], [incumbent])
     assert fit.divergence == 7.0
     assert len({str(s) for s in seeds}) == 4, "each measurement has rollouts of its own"
     assert fit.candidates[-8:, 2].mean() > 0.9, "refinements are drawn around the best of the search"
+
+
+def test_with_common_random_numbers_equal_candidates_have_equal_divergences():
+    """The same starts and the same noise: what is left of a difference is the weights'."""
+    shown = shown_by(TWO).select([0])
+    twins = Mixtures(TWO, [[0.5, 0.5], [0.5, 0.5], [0.6, 0.4]])
+    own, common = (policy_divergences(twins, shown, 0, n_rollouts=2, common=c) for c in (False, True))
+    assert own[0] != own[1]
+    assert common[0] == common[1] != common[2]
+    data = rollout(INVERTED_PENDULUM, twins, 3, 0, horizon=20, common=True)
+    assert (data.reset_seeds == data.reset_seeds[0]).all()
+    noise = (data.actions - twins.mean(data.observations[:, :, 0])[:, :, None]) / twins.sigma[:, :, None]
+    assert np.allclose(noise[:, :, 0], noise[0, :, 0], atol=1e-5)
+    fit = search_mixture(TWO, shown, replace(QUICK, common=True), 0)
+    assert fit.steps == search_mixture(TWO, shown, QUICK, 0).steps
+
+
+def test_the_bound_on_weights_is_what_least_squares_reaches():
+    """Many noisy people with known means: the deviation of the regression is the Cramer-Rao bound."""
+    policies = GaussianPolicies(INVERTED_PENDULUM, 3, 0)
+    policies.network.weights[-1].data.mul_(50)
+    three, weights, found = policies.actor(), np.array([0.5, 0.2, 0.3]), []
+    actor = Mixtures(three, [weights])
+    data = rollout(INVERTED_PENDULUM, actor, 2, 1, horizon=200)
+    shown = demonstrations_from(data, actor)
+    bound = policy_mixture.weight_deviations(three, shown, weights)
+    means, rng = actor.mean(data.observations[0, :, :-1].reshape(1, -1, 4)), np.random.default_rng(0)
+    for _ in range(300):
+        acted = means + actor.sigma * rng.standard_normal(means.shape)
+        noisy = replace(shown, actions=acted.reshape(shown.actions.shape).astype(np.float32))
+        a, mu, _ = policy_mixture.inside_bounds(three, noisy)
+        third = np.linalg.lstsq((mu[:2] - mu[2]).T, a - mu[2], rcond=None)[0]
+        found.append([*third, 1 - third.sum()])
+    assert np.std(found, axis=0) == pytest.approx(bound, rel=0.2)
+
+
+def test_where_two_people_act_alike_nobody_can_say_whose_share_it_is():
+    twins = balancers([0.4, 0.4 + 1e-4, -0.4])
+    shown = shown_by(Mixtures(twins, [[0.5, 0.0, 0.5]]), 200)
+    alike, alike_too, other = policy_mixture.weight_deviations(twins, shown, [0.3, 0.2, 0.5])
+    assert min(alike, alike_too) > 100 * other
+
+
+def test_policies_of_another_domain_cannot_explain():
+    lander = GaussianPolicies(LUNAR_LANDER, 2, 0).actor()
+    with pytest.raises(
+        InputError, match=r"^a mixture of policies of lunar_lander cannot explain a demonstra"
+    ):
+        search_mixture(lander, shown_by(TWO).select([0]), QUICK, 0)
 
 
 @pytest.mark.parametrize("change", [{"n_candidates": 0}, {"n_refinements": 0}])

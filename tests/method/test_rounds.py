@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from tiny import GENEROUS, PENDULUM, TINY, after, assert_same, copied, everything, forbid, same, watch
 
+from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method import rounds
 from dmsrd_lite.method.policy_mixture import MixtureFit
 from dmsrd_lite.method.state import State
@@ -20,21 +21,21 @@ def test_a_round_has_all_demonstrations_and_the_decided_weights(three, mixed, mo
     made = watch(monkeypatch, rounds, "MSRD")
     state, record, steps = rounds.play_round(mixed, False, 1e9, TINY, [0])
     (one,) = made
-    everyone, weights, pure = one["between"]
-    assert np.array_equal(everyone.observations, three.observations)
+    states, weights, pure = one["between"]
+    shown = {tuple(row) for row in three.observations[2].reshape(-1, 4)}
+    assert states.shape == (3, rounds.N_STATES, 4)
+    assert {tuple(row) for row in states[2]} <= shown, "of the third one's own states"
     assert np.array_equal(one["learner"].between[1].numpy(), weights)
     assert (weights.tolist(), tuple(pure)) == (mixed.weights.tolist(), (0, 1))
     assert np.array_equal(one["demonstrations"].observations, three.observations[:2]), "the pure ones"
     assert same(one["networks"], mixed.networks)
     assert same(one["learner"].networks(), state.networks)
-    assert one["learner"].n_averaged == 2, "the average of the rewards goes on over the rounds"
-    assert steps == {"search": 0, "msrd": 2 * 50}
+    assert one["learner"].n_averaged == 2 + 2, "the average of the rewards goes on over the rounds"
+    assert steps == {"search": 0, "msrd": 2 * 50, "between_class": 0}
     assert record["recognized"].tolist() == state.recognized([0, 1, 2]).tolist()
     for name, then in (("before", mixed), ("after", state)):
         assert np.array_equal(record[f"kl_{name}_round"], then.divergences(range(3), [0, 3], 2))
     assert (record["kl_before_round"] != record["kl_after_round"]).all()
-    rounds.play_round(mixed, False, 1e9, replace(TINY, between_class=False), [0])
-    assert made[1]["between"] is None
 
 
 def test_one_strategy_has_no_round(three, states, monkeypatch):
@@ -44,7 +45,7 @@ def test_one_strategy_has_no_round(three, states, monkeypatch):
     state, record, steps = rounds.play_round(known, False, 1e-3, TINY, [0])
     assert state is known
     assert record["kl_before_round"] is record["kl_after_round"]
-    assert (record["searched_again"], steps) == ({}, {"search": 0, "msrd": 0})
+    assert (record["searched_again"], steps) == ({}, {"search": 0, "msrd": 0, "between_class": 0})
 
 
 @pytest.mark.parametrize(
@@ -86,6 +87,37 @@ def test_an_older_mixture_is_searched_again_where_its_kl_has_risen(
         assert np.array_equal(actor.mean(x), now.mean(x)), "the policies are those after the round"
 
 
+@pytest.mark.parametrize(
+    ("between_class", "created", "asked"),
+    [("always", True, True), ("always", False, True), ("mixtures", True, False), ("mixtures", False, True),
+     ("never", False, False)],
+)  # fmt: skip
+def test_equation_4_is_asked_after_some_branches(between_class, created, asked, mixed, monkeypatch):
+    made = watch(monkeypatch, rounds, "MSRD")
+    rounds.play_round(mixed, created, 1e9, replace(TINY, between_class=between_class), [0])
+    assert (made[0]["between"] is not None) == asked
+
+
+def test_equation_4_can_be_asked_on_rollouts_of_what_explains_people(mixed, monkeypatch):
+    made = watch(monkeypatch, rounds, "MSRD")
+    _, _, steps = rounds.play_round(mixed, False, 1e9, replace(TINY, own_rollouts=2), [0])
+    states, weights, _ = made[0]["between"]
+    flown = rollout(mixed.domain, mixed.mixtures(), 2, [0, 7, 0])
+    known = {tuple(row) for row in flown.observations[2].reshape(-1, 4)}
+    assert {tuple(row) for row in states[2]} <= known
+    assert steps["between_class"] == flown.n_steps
+    assert weights.tolist() == mixed.weights.tolist()
+
+
+def test_an_older_mixture_keeps_its_weights_where_nobody_searches_again(mixed, three, monkeypatch):
+    forbid(monkeypatch, (rounds, "search_mixture"))
+    known = replace(mixed, records=(*mixed.records, {"threshold": 0.0, "n_strategies": 2}))
+    known = known.explained(three.select([0]), np.array([0.5, 0.5]))
+    state, record, _ = rounds.play_round(known, False, 0.0, replace(TINY, search_again=False), [0])
+    assert record["searched_again"] == {}
+    assert state.weights.tolist() == known.weights.tolist()
+
+
 @pytest.mark.parametrize("created", [True, False])
 @pytest.mark.parametrize("moving", [True, False])
 def test_a_round_after_a_mixture_can_leave_policies_alone(moving, created, mixed):
@@ -106,8 +138,8 @@ def test_a_round_works_on_a_bounded_sample_and_measures_no_more(three, states, m
         some, n = r["remembered"], r["demonstration"]
         assert {0, 1, n} <= set(some) <= set(range(n + 1))
         assert len(r["kl_before_round"]) == len(r["kl_after_round"]) == len(some)
-        known, weights, pure = one["between"]
-        assert np.array_equal(known.observations, state.shown.select(some).observations)
+        asked, weights, pure = one["between"]
+        assert len(asked) == len(some)
         assert np.array_equal(weights, state.weights[some])
         assert [some[i] for i in pure] == [0, 1]
     wide = [after(states[2], three.select([2]), replace(GENEROUS, remembered=n)) for n in (5, 0)]

@@ -72,16 +72,16 @@ def test_other_files_are_refused_in_one_sentence(states, tmp_path, monkeypatch):
     save_file({"weights": torch.zeros(2)}, tmp_path / "tensors")
     save_file({"weights": torch.zeros(2)}, tmp_path / "foreign", metadata={"format": "pt"})
     with monkeypatch.context() as patch:
-        patch.setattr(stream, "_VERSION", 3)
+        patch.setattr(stream, "_VERSION", 4)
         save_state(tmp_path / "newer", states[1])
     save_state(tmp_path / "other", replace(states[1], domain=replace(PENDULUM, name="other")))
     for name, sentence in {
         "text": "cannot be read",
         "nothing": "cannot be read",
         ".": "cannot be read",
-        "tensors": "is a None of version None; expected 'dmsrd_lite state' of version 2",
+        "tensors": "is a None of version None; expected 'dmsrd_lite state' of version 3",
         "foreign": "cannot be read",
-        "newer": "is a 'dmsrd_lite state' of version 3; expected 'dmsrd_lite state' of version 2",
+        "newer": "is a 'dmsrd_lite state' of version 4; expected 'dmsrd_lite state' of version 3",
         "other": "holds a state of other; expected inverted_pendulum",
     }.items():
         path = (tmp_path / name).resolve()

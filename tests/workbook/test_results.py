@@ -66,3 +66,33 @@ def test_what_follows_from_a_row_by_hand():
     assert found["AIRL", "log_likelihood_above_own"] == pytest.approx(0.0)
     assert found["reward: AIRL", "pearson"] == 0.9
     assert ("AIRL", "curve") not in found
+
+
+def test_searches_and_recognition_by_hand():
+    row = {"known": 2, "search": "random", "budget": 96, "above_floor": 0.5, "error": 0.1, "steps": 100.0}
+    early, free = (
+        {**row, "budget": 12, "error": 0.9},
+        {**row, "search": "actions", "budget": 0, "error": 0.02},
+    )
+    other = {**row, "above_floor": 1.5}
+    found = results._numbers({"results": {"rows": [early, row, other, free]}, "settings": {}}, None)
+    found = {(method, metric): np.mean(value) for method, metric, value in found}
+    assert found["random, 2 known", "divergence_above_floor"] == 1.0
+    assert found["random, 2 known", "weight_error"] == pytest.approx(0.1)
+    assert found["actions, 2 known", "weight_error"] == 0.02
+    known = {"recognized": {"shown": 2, "30 fresh": 1}, "task": 0.8}
+    known["means"] = {"shown": [[0.0]] * 4, "30 fresh": [[0.0]] * 4}
+    record = {"results": {"n_fresh": [30], "table": {"MSRD": known}}, "settings": {}}
+    found = {(method, metric): value for method, metric, value in results._numbers(record, None)}
+    shares = {"recognized_on_shown": 0.5, "recognized_on_30": 0.25, "pearson": 0.8}
+    assert found == {("MSRD", metric): value for metric, value in shares.items()}
+
+
+def test_a_run_of_dmsrd_has_shares_of_its_own_strategies():
+    scores = {"environment_return": [-5.0], "failure_share": [0.0], "decisions": [{}], "branches": ["x"]}
+    scores |= {"pure": [0, 1], "recognized_fresh": {"shown": 2, "3": 1}}
+    domain = DOMAINS["inverted_pendulum"]
+    found = {(a, b): c for a, b, c in results._scores("ours", scores, domain, None, None)}
+    assert found["ours", "recognized_on_shown"] == 1.0
+    assert found["ours", "recognized_on_3"] == 0.5
+    assert not {metric for _, metric in found} & {"decisions", "branches", "pure", "recognized_fresh"}

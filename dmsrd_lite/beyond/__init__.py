@@ -1,0 +1,5 @@
+"""What the paper leaves for later: another search for mixture weights (``cma_search``) and another divergence
+(``sliced_wasserstein``), both for lesson 04.
+
+Imports ``method`` and what that may import.
+"""
