@@ -23,8 +23,8 @@ def test_lesson_runs_quick(domain, path, tmp_path):
     executed = nbformat.read(output, 4)
     assert {"seconds", "environment_steps"} < handed_over(executed).keys()
     text = "".join(o.get("text", "") for c in executed.cells for o in c.get("outputs", []))
-    assert "holds:" in text
-    assert domain == "lunar_lander" or "does not hold" not in text
+    claimed = "holds:" in text, "does not hold:" in text  # on the lander a small run may miss all of them
+    assert claimed == (True, False) or (domain == "lunar_lander" and any(claimed))
 
 
 @pytest.mark.lesson

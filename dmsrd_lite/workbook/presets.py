@@ -97,7 +97,7 @@ def from_nothing(domain: str, settings: AIRLSettings, **changes: Any) -> Any:
 
 
 # The methods of the comparison. Lander: as many updates of R_Task as DMSRD makes in all; more make it worse.
-_LANDER_ROUND = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=6)
+_LANDER_ROUND = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=6, between_class_extra=40)
 METHODS = {
     PENDULUM: MethodSettings(dmsrd=DMSRDSettings(mixture=_OURS[PENDULUM])),
     LANDER: MethodSettings(
