@@ -130,7 +130,7 @@ def rollout(
     drawn = draw_reset_seeds(rng, n_draws, e)
     reset_seeds = np.broadcast_to(drawn, (m, e)) if reset_seeds is None else np.asarray(reset_seeds)
     noise = rng.standard_normal((t_end, n_draws, e, domain.action_dim), dtype=np.float32)
-    noise = np.repeat(noise, m // n_draws, axis=1)
+    noise = np.repeat(noise, m, axis=1) if common else noise
     log_densities = gaussian_log_density(noise, np.float32(0), np.float32(1)) - np.log(actor.sigma).sum(-1)
     noise *= actor.sigma
     # Always the same two halves, and so the same bits; on two threads one acts while the other is simulated.

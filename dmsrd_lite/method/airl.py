@@ -172,7 +172,8 @@ class AIRL:
         )
         if shared is not None:
             for rewards in (self.rewards, self.averaged_rewards):
-                rewards.task_reward = copy.deepcopy(shared.task_reward).requires_grad_(False)
+                rewards.task_reward.load_state_dict(shared.task_reward.state_dict())
+                rewards.task_reward.requires_grad_(False)
         self.replay: deque[Samples] = deque(maxlen=settings.replay_iterations or None)
         self.coverage: list[Samples] = []
         self.anchors: list[Samples] = []  # of an earlier learner's replay: what it saw on the way

@@ -8,6 +8,8 @@ import torch
 from dmsrd_lite.domains import Domain
 from dmsrd_lite.domains.domain import Seed
 
+N_STATES = 3000  # of each person, on which Equation 4 is asked
+
 
 def between_class_loss(mean_rewards: torch.Tensor, weights: torch.Tensor, pure: torch.Tensor) -> torch.Tensor:
     """``sum_i (exp(eta_S-j(tau_i)) - w_ij exp(eta_S-j(tau_m_j)))^2`` of each strategy j: (M,). Equation 4.
@@ -20,7 +22,7 @@ def between_class_loss(mean_rewards: torch.Tensor, weights: torch.Tensor, pure: 
     return (mean_rewards.exp() - weights.T * own).square().sum(1)
 
 
-def states_of(domain: Domain, observations: np.ndarray, n_states: int, seed: Seed) -> np.ndarray:
+def states_of(domain: Domain, observations: np.ndarray, seed: Seed, n_states: int = N_STATES) -> np.ndarray:
     """What Equation 4 is asked on: of each of n people (n, k, T+1, obs_dim) as many states that tell who
     acts, drawn at random; (n, n_states, obs_dim)."""
     rng = np.random.default_rng(seed)

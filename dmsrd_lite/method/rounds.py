@@ -11,8 +11,6 @@ from dmsrd_lite.method.msrd import MSRD
 from dmsrd_lite.method.policy_mixture import search_mixture
 from dmsrd_lite.method.state import State
 
-N_STATES = 3000  # of each person, for Equation 4
-
 if TYPE_CHECKING:
     from dmsrd_lite.method.dmsrd import DMSRDSettings
 
@@ -50,7 +48,7 @@ def play_round(
         for _ in learner.train():
             pass
         learner.settle()
-        state, steps["msrd"] = (replace(state, networks=learner.networks()), learner.steps * len(pure))
+        state, steps["msrd"] = replace(state, networks=learner.networks()), learner.steps * len(pure)
         after, weights, policies = measure(), state.weights.copy(), state.policies().actor()
         risen = np.flatnonzero(after > thresholds[: len(after)])  # its own strategies have moved away
         for k in risen if s.search_again else ():
@@ -77,11 +75,12 @@ def _states(
     Of what they showed; or (``own_rollouts``) of what explains them, acting from new starts: what was shown
     started in three places, and these are what is learned otherwise.
     """
-    observations, steps = state.shown.select(some).observations, 0
     if settings.own_rollouts:
         data = rollout(state.domain, state.mixtures(some), settings.own_rollouts, [*seed, 0])
         observations, steps = data.observations, data.n_steps
-    return states_of(state.domain, observations, N_STATES, [*seed, 1]), steps
+    else:
+        observations, steps = state.shown.select(some).observations, 0
+    return states_of(state.domain, observations, [*seed, 1]), steps
 
 
 def remembered(state: State, n: int, seed: list[int]) -> np.ndarray:

@@ -47,13 +47,11 @@ class State:
 
     def policies(self) -> GaussianPolicies:
         """The M strategies' policies."""
-        policies = GaussianPolicies(self.domain, self.n_strategies or 1, 0)
-        return self._load(policies, under("policies", self.networks))
+        return self._load(GaussianPolicies(self.domain, self.n_strategies or 1, 0), "policies")
 
     def rewards(self) -> Rewards:
         """R_Task and the M strategy rewards, averaged over the training (``AIRL.averaged_rewards``)."""
-        rewards = Rewards(self.domain, self.n_strategies or 1, 0.99, 0, self.alpha)
-        return self._load(rewards, under("averaged", self.networks))
+        return self._load(Rewards(self.domain, self.n_strategies or 1, 0.99, 0, self.alpha), "averaged")
 
     def mixtures(self, some: Sequence[int] | np.ndarray | slice = slice(None)) -> Mixtures:
         """What explains the demonstrations ``some`` (default: all), one mixture each."""
@@ -69,9 +67,9 @@ class State:
             self.rewards().mean_rewards(self.shown.select(some)), np.searchsorted(some, self.pure)
         )
 
-    def _load(self, module: Module, known: dict[str, torch.Tensor]) -> Module:
-        if self.shown:  # InputError before the first demonstration
-            module.load_state_dict(known)
+    def _load(self, module: Module, name: str) -> Module:
+        known = under(name, self.networks) if self.shown else {}  # InputError before the first demonstration
+        module.load_state_dict(known)
         return module
 
     def explained(self, new: DemonstrationSet, weights: np.ndarray) -> "State":

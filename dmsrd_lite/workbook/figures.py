@@ -8,7 +8,7 @@ import numpy as np
 import seaborn
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from dmsrd_lite.domains import Domain
 from dmsrd_lite.domains.domain import Drawing, InputError
@@ -192,6 +192,7 @@ def plot_decisions(records: Sequence[dict], floor: np.ndarray, ax: Axes | None =
     ax.set(ylabel="KL (nats)", yscale="log", xticks=x, xticklabels=ticks)
     ax.set_xlabel("demonstration, in order of arrival (strategies so far)")
     ax.set_xlim(-0.5, len(records) - 0.5)
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter(ScalarFormatter())
     ax.yaxis.set_minor_formatter(NullFormatter())
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=8)

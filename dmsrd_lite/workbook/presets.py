@@ -50,7 +50,7 @@ TEST_SETS = {name: _for_test_sets(usual) for name, usual in DEMONSTRATORS.items(
 
 # The search for a mixture (Equation 3): candidates, then refinements around the best of them.
 MIXTURE = {PENDULUM: MixtureSettings(64, 32), LANDER: MixtureSettings(64, 32)}
-_OURS = {name: replace(usual, from_actions=True) for name, usual in MIXTURE.items()}  # lesson 04 says why
+_OURS = {name: replace(usual, from_actions=True) for name, usual in MIXTURE.items()}  # the likeliest first
 QUICK_MIXTURE = MixtureSettings(24, 16, n_finalists=5)
 
 _DRIFT = ((1.0, 0.5), (1.0, 1.0), (1.0, 2.0))  # rollouts of the untrained policy that lean to one side
@@ -238,7 +238,6 @@ class DiscriminationLesson:  # 05
     msrd: MSRDSettings
     n_own: int  # rollouts from new starts on which Equation 4 is asked
     n_fresh: tuple[int, ...] = (3, 10, 30)  # fresh takes on which recognition is measured
-    n_states: int = 3000  # of each person
 
     @property
     def as_printed(self) -> MSRDSettings:
@@ -262,7 +261,6 @@ class DMSRDLesson:  # 06
     users: tuple[int, ...]
     mixtures: tuple[tuple[float, ...], ...]  # users who arrive after them: weights of ``users``
     loop: DMSRDSettings  # ours, from a clone
-    fresh: TrainingSettings  # policies on the frozen task reward
     n_fresh: tuple[int, ...] = (3, 10, 30)  # fresh takes on which recognition is measured
     n_known: int = 5  # the rule for eps: so many are known ...
     n_decisions: int = 20  # ... and so many people of a new kind, and as many mixtures, arrive
@@ -284,10 +282,6 @@ class DMSRDLesson:  # 06
         by_states = replace(self.loop, mixture=replace(self.loop.mixture, from_actions=False))
         found["from_actions as printed"] = by_states
         return found | {"without BCD": replace(self.loop, between_class="never")}
-
-    @property
-    def generous(self) -> DMSRDSettings:
-        return replace(self.loop, kl_threshold=1000.0)
 
 
 @dataclass(frozen=True)
@@ -334,16 +328,17 @@ def _dmsrd(domain: str, quick: bool) -> DMSRDLesson:
     loop = METHODS[domain].dmsrd
     if not quick:
         halves = tuple(tuple((i in pair) / 2 for i in range(10)) for pair in ((0, 1), (2, 3), (3, 5)))
-        return DMSRDLesson(domain, tuple(range(10)), halves, loop, _fresh(domain))
+        return DMSRDLesson(domain, tuple(range(10)), halves, loop)
     airl = AIRLSettings(n_iterations=4, episodes=4, cloning_steps=1000, coverage_episodes=1)
     msrd = replace(loop.msrd, n_iterations=3, episodes=2, discriminator_steps=24)
     mixture = MixtureSettings(12, 8, n_finalists=3, from_actions=True)
     loop = replace(loop, airl=airl, msrd=msrd, mixture=mixture, own_rollouts=5)
-    return DMSRDLesson(domain, (0, 1, 3), ((0.5, 0.5, 0.0), (0.3, 0.0, 0.7)), loop, _fresh(domain))
+    return DMSRDLesson(domain, (0, 1, 3), ((0.5, 0.5, 0.0), (0.3, 0.0, 0.7)), loop)
 
 
 def _fresh(domain: str) -> TrainingSettings:
-    """Long, and slower towards the end: too short a training looks like a reward that does not teach."""
+    """On the pendulum long, and slower towards the end: too short a training looks like a reward that does
+    not teach. On the lander as its records were made."""
     if domain == LANDER:
         return replace(TRAINING[domain], n_strategies=5, n_iterations=120, hold=0.5, growing=0.9)
     return TrainingSettings(n_strategies=10, n_iterations=240, hold=0.75, growing=0.92, last_rate=0.1)

@@ -74,9 +74,7 @@ def _numbers(record: dict, domain: Domain) -> Iterator[tuple[str, str, Any]]:
         yield from _scores(f"ours, clone: {name}", scores, domain, floor, own)
     for name, scores in r.get("variants", {}).items():
         yield from _scores(f"variant: {name}", scores, domain, floor[few], own[few])
-    for name, scores in r.get("worth", {}).items():
-        yield from _scores(f"fresh policies on: {name}", scores, domain, None, None)
-    for name, scores in r.get("ingredients", {}).items():
+    for name, scores in {**r.get("worth", {}), **r.get("ingredients", {})}.items():
         yield from _scores(f"fresh policies on: {name}", scores, domain, None, None)
     for name, found in r.get("correlations", {}).items():
         yield from ((f"reward: {name}", kind, value) for kind, value in found.items())

@@ -111,7 +111,7 @@ def test_states_that_are_everybodys_do_not_count():
     lander[:, :, 4:] = False
     assert np.array_equal(LUNAR_LANDER.tells(observations), lander)
     assert INVERTED_PENDULUM.tells(observations[..., :4]).all()
-    states = states_of(LUNAR_LANDER, observations, 50, [0])
+    states = states_of(LUNAR_LANDER, observations, [0], 50)
     assert states.shape == (2, 50, 8)
     for person in range(2):
         flown = {tuple(row) for row in observations[person, :, :4].reshape(-1, 8)}

@@ -7,6 +7,7 @@ from tiny import GENEROUS, PENDULUM, TINY, after, assert_same, copied, everythin
 
 from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method import rounds
+from dmsrd_lite.method.between_class_discrimination import N_STATES
 from dmsrd_lite.method.policy_mixture import MixtureFit
 from dmsrd_lite.method.state import State
 
@@ -23,7 +24,7 @@ def test_a_round_has_all_demonstrations_and_the_decided_weights(three, mixed, mo
     (one,) = made
     states, weights, pure = one["between"]
     shown = {tuple(row) for row in three.observations[2].reshape(-1, 4)}
-    assert states.shape == (3, rounds.N_STATES, 4)
+    assert states.shape == (3, N_STATES, 4)
     assert {tuple(row) for row in states[2]} <= shown, "of the third one's own states"
     assert np.array_equal(one["learner"].between[1].numpy(), weights)
     assert (weights.tolist(), tuple(pure)) == (mixed.weights.tolist(), (0, 1))
