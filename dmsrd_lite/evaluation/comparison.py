@@ -1,7 +1,8 @@
 """Every method of the comparison through one door: the same demonstrations, budget, start and score."""
 
+import copy
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -51,6 +52,7 @@ class Learned:
     search_steps: int = 0
     seconds: float = 0.0
     curve: Sequence[Sequence[float]] = ()  # by iteration: a strategy's steps, true reward per step (M)
+    decisions: tuple[dict, ...] = ()  # DMSRD's records, one for each demonstration
 
     def actor(self) -> Mixtures:
         return Mixtures(self.policies.actor(), self.weights)
@@ -70,6 +72,23 @@ def train_method(
     method: str, shown: DemonstrationSet, settings: MethodSettings, seed: int, progress: Callable = iter
 ) -> Learned:
     """Train one of ``METHODS`` on the demonstrations in their order; ``progress`` wraps an iterable."""
+    *_, (_, learned) = train_to(method, shown, settings, seed, progress=progress)
+    return learned
+
+
+def train_to(
+    method: str,
+    shown: DemonstrationSet,
+    settings: MethodSettings,
+    seed: int,
+    budgets: Sequence[int] = (),
+    progress: Callable = iter,
+) -> Iterator[tuple[int, Learned]]:
+    """One training: what is known when each of ``budgets`` (ascending; environment steps per demonstration)
+    is spent, and in the end, each with the steps per demonstration so far.
+
+    Copies: training goes on after them. DMSRD and cloning are known in the end only.
+    """
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}: expected one of {', '.join(METHODS)}")
     start, n = time.perf_counter(), shown.n_demonstrations
@@ -80,7 +99,9 @@ def train_method(
         elif method != "DMSRD":
             loop = replace(loop, between_class="never")
         *_, state = progress(learn(State(shown.domain, seed), shown, loop))
-        return learned_by(state)
+        learned = learned_by(state)
+        yield learned.steps // n, learned
+        return
     pure, weights, part = tuple(range(n)), np.eye(n), "g"
     learner: AIRL
     if method == "MSRD":
@@ -92,14 +113,22 @@ def train_method(
     else:
         only_clone = replace(settings.airl, n_iterations=0, coverage="none", start="clone")
         clone = AIRL(shown, only_clone, seed).policies
-        return Learned(clone, weights, seconds=time.perf_counter() - start)
-    curve = [
-        [r["steps"], *(r["environment_return"] / r["horizon"]).round(4)] for r in progress(learner.train())
-    ]
-    steps, seconds = learner.steps * len(learner.x), time.perf_counter() - start
-    return Learned(
-        learner.learned_policies, weights, learner.learned_rewards, part, pure, steps, 0, seconds, curve
-    )
+        yield 0, Learned(clone, weights, seconds=time.perf_counter() - start)
+        return
+    curve: list[list[float]] = []
+
+    def known() -> tuple[int, Learned]:
+        models = copy.deepcopy((learner.learned_policies, learner.learned_rewards))
+        spent, seconds = learner.steps * len(learner.x), time.perf_counter() - start
+        return spent // n, Learned(models[0], weights, models[1], part, pure, spent, 0, seconds, [*curve])
+
+    left = list(budgets)
+    for r in progress(learner.train()):
+        curve.append([r["steps"], *(r["environment_return"] / r["horizon"]).round(4)])
+        if left and learner.steps * len(learner.x) >= left[0] * n:
+            left = [budget for budget in left if learner.steps * len(learner.x) < budget * n]
+            yield known()
+    yield known()
 
 
 def learned_by(state: State) -> Learned:
@@ -108,7 +137,8 @@ def learned_by(state: State) -> Learned:
     training = sum(s["airl"] + s["msrd"] + s["between_class"] for s in steps)
     spent = training, sum(s["search"] for s in steps)
     seconds = sum(record["seconds"] for record in state.records)
-    return Learned(state.policies(), state.weights, state.rewards(), "task", state.pure, *spent, seconds)
+    known = state.policies(), state.weights, state.rewards(), "task", state.pure
+    return Learned(*known, *spent, seconds, decisions=state.records)
 
 
 def score_method(

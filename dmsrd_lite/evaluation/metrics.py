@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.stats import rankdata
+from scipy.stats import norm, rankdata
 
 from dmsrd_lite.demonstrations import DemonstrationSet, RewardTestSet
 from dmsrd_lite.domains.domain import Seed, extend
@@ -54,6 +54,27 @@ def score_policies(
         "divergence": divergences,
         "log_likelihood_per_step": demonstration_log_likelihood(actor, demonstrations)
         / demonstrations.horizon,
+    }
+
+
+PUBLISHED_SIGMA, PUBLISHED_FLOOR = 0.0628, 1e-37  # in the authors' code: of every action; of a density
+
+
+def published_scores(actor: Policies, demonstrations: DemonstrationSet, seed: Seed) -> dict[str, np.ndarray]:
+    """As the authors' published code scores, (n,) each; for a comparison with the paper's numbers alone.
+
+    published_return: rewards of 20 rollouts, paid on every step, whether the task would be over or not.
+    published_log_likelihood: ``sum log max(N(a; mu(s), 0.0628^2), 1e-37)`` over all trajectories together.
+    """
+    domain = demonstrations.domain
+    data = rollout(domain, actor, 20, seed, horizon=demonstrations.horizon)
+    n, _, t = demonstrations.actions.shape[:3]
+    states = demonstrations.observations[:, :, :t].reshape(n, -1, domain.obs_dim)
+    acted = demonstrations.actions.reshape(n, states.shape[1], -1)
+    log_pi = norm.logpdf(acted, actor.mean(states), PUBLISHED_SIGMA).sum(-1)
+    return {
+        "published_return": data.rewards_every_step.sum(-1).mean(1),
+        "published_log_likelihood": np.maximum(log_pi, np.log(PUBLISHED_FLOOR)).sum(1),
     }
 
 

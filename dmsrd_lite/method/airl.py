@@ -39,6 +39,7 @@ Samples = tuple[
 @dataclass(frozen=True)
 class AIRLSettings:
     n_iterations: int = 30
+    max_steps: int = 0  # ends with the iteration in which a strategy has spent so many; 0: n_iterations count
     episodes: int = 8  # per strategy and iteration
     discount: float = 0.99  # gamma, in f and for the policy
     start: str = "clone"  # policies start from behavioural cloning and stay near it, or from "nothing"
@@ -85,6 +86,8 @@ class AIRLSettings:
         for name, least in (("policy_average", 0.0), ("last_rate", 0.0), ("iterates_share", 1e-9)):
             if not least <= getattr(self, name) <= 1:
                 raise InputError(f"{name} {getattr(self, name)!r}: expected a share of at most 1")
+        if self.max_steps < 0:
+            raise InputError(f"max_steps {self.max_steps!r}: expected a number of steps, or 0 for no limit")
         if not self.penalty_slope > 0:
             raise InputError(f"penalty_slope {self.penalty_slope!r}: expected a positive number")
         if self.first_horizon < 0 or self.growth < 1 or (self.first_horizon and self.growth == 1):
@@ -238,6 +241,8 @@ class AIRL:
         if s.coverage != "none" and not self.coverage and not self.anchors and not self.iteration:
             self._explore()
         for iteration in progress(range(self.iteration, s.n_iterations)):
+            if s.max_steps and self.steps >= s.max_steps:
+                break
             clock = [time.perf_counter()]
             seeds = [[*self.seed, part, iteration] for part in (10, 11, 12, 13)]
             actor, horizon = self.policies.actor(), int(self.length)
@@ -261,7 +266,8 @@ class AIRL:
                     states, acted = (part.reshape(len(self.x), -1, part.shape[-1]) for part in flown)
                     own = actor.log_density(states, acted)
                     self.tune_entropy(log_pi[:, self._near()].mean(1).numpy(), own.mean(1))
-                self.optimizer.slow_down(1 - (1 - s.last_rate) * max(0.0, 2 * iteration / s.n_iterations - 1))
+                share = max(iteration / s.n_iterations, self.steps / s.max_steps if s.max_steps else 0)
+                self.optimizer.slow_down(1 - (1 - s.last_rate) * max(0.0, 2 * min(1.0, share) - 1))
                 paid = self.policy_rewards(data)
                 self.optimizer.update(data, paid, seeds[3], demonstrations=shown, cloning_weight=weight)
                 if s.policy_average:

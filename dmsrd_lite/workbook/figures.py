@@ -12,6 +12,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from dmsrd_lite.domains import Domain
 from dmsrd_lite.domains.domain import Drawing, InputError
+from dmsrd_lite.evaluation.statistics import Ranks
 from dmsrd_lite.method.dmsrd import BETTER_MIXTURE, MIXTURE, NEW_STRATEGY
 
 # Okabe-Ito, then darker shades: strategy k has colour k and marker k in every notebook. Black is the truth.
@@ -216,6 +217,18 @@ def plot_stream(records: Sequence[dict], floor: np.ndarray, ax: Axes | None = No
     ax.plot(x, [r["threshold"] for r in records], color=INKS[3], label="threshold", linewidth=0.8)
     ax.set(ylabel="KL (nats)")
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5)
+    return ax
+
+
+def plot_ranks(ranks: Ranks, names: Sequence[str], ax: Axes | None = None) -> Axes:
+    """Mean ranks (1 is best) with half a critical difference to both sides: bars that do not overlap are
+    told apart at 5 % (Demsar, 2006)."""
+    ax = ax or plt.gca()
+    order, half = np.argsort(-ranks.mean_ranks), ranks.critical_difference() / 2
+    y = np.arange(len(order))
+    ax.errorbar(ranks.mean_ranks[order], y, xerr=half, fmt="o", color=INK, capsize=3)
+    ax.set(yticks=y, yticklabels=[names[i] for i in order], xlabel="mean rank", xlim=(0.5, len(y) + 0.5))
+    ax.set_title(f"Q({len(y) - 1}) = {ranks.q:.1f}, p = {ranks.p:.2g}", loc="right")
     return ax
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from dmsrd_lite.demonstrators.diayn import DiaynSettings
-from dmsrd_lite.domains import InputError
+from dmsrd_lite.domains import InputError, get_domain
+from dmsrd_lite.evaluation.comparison import METHODS as METHOD_NAMES
 from dmsrd_lite.evaluation.comparison import MethodSettings
 from dmsrd_lite.learning.policy_optimization import PPOSettings, TrainingSettings
 from dmsrd_lite.method.airl import AIRLSettings
@@ -238,6 +239,9 @@ class DiscriminationLesson:  # 05
     msrd: MSRDSettings
     n_own: int  # rollouts from new starts on which Equation 4 is asked
     n_fresh: tuple[int, ...] = (3, 10, 30)  # fresh takes on which recognition is measured
+    windows: tuple[int, ...] = (0, 1, 10)  # one state, or two so many steps apart, by Equation 4 alone
+    window_updates: int = 480  # as many as beside AIRL
+    window_rate: float = 1e-3
 
     @property
     def as_printed(self) -> MSRDSettings:
@@ -261,10 +265,12 @@ class DMSRDLesson:  # 06
     users: tuple[int, ...]
     mixtures: tuple[tuple[float, ...], ...]  # users who arrive after them: weights of ``users``
     loop: DMSRDSettings  # ours, from a clone
+    fresh: TrainingSettings  # policies on the frozen task reward
     n_fresh: tuple[int, ...] = (3, 10, 30)  # fresh takes on which recognition is measured
     n_known: int = 5  # the rule for eps: so many are known ...
     n_decisions: int = 20  # ... and so many people of a new kind, and as many mixtures, arrive
     margins: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # eps above its reference (nats)
+    ablated_seed: int = 0  # only with this one deviations are taken back, too
 
     @property
     def forms(self) -> dict[str, DMSRDSettings]:
@@ -282,6 +288,62 @@ class DMSRDLesson:  # 06
         by_states = replace(self.loop, mixture=replace(self.loop.mixture, from_actions=False))
         found["from_actions as printed"] = by_states
         return found | {"without BCD": replace(self.loop, between_class="never")}
+
+
+BENCHMARK = {  # what each part trains: method, start
+    "clone": [(method, "clone") for method in METHOD_NAMES],
+    "rivals": [(method, "nothing") for method in ("AIRL Single", "AIRL Batch", "MSRD")],
+    "ours": [("DMSRD without BCD", "nothing"), ("DMSRD", "nothing")],
+    "printed": [("DMSRD as printed", "nothing")],
+}
+
+
+@dataclass(frozen=True)
+class BenchmarkLesson:  # 07
+    domain: str
+    users: tuple[int, ...]
+    budgets: tuple[int, ...]  # environment steps per demonstration; rivals are looked at on the way
+    printed: tuple[int, ...]  # DMSRD as printed is trained for each of these
+    main: int  # of which the tables are made
+    from_clone: int  # the budget of everybody who starts from a clone
+    live: MethodSettings  # of a small benchmark from a clone
+    n_fresh: tuple[int, ...] = (3, 10, 30)
+
+    def trained_for(self, method: str, start: str) -> tuple[int, ...]:
+        """The budgets that ask for a training of their own."""
+        if start == "clone":
+            return (self.from_clone,)
+        if method.startswith("DMSRD"):
+            return self.printed if method == "DMSRD as printed" else (self.main,)
+        return (max(self.budgets),)
+
+    def methods(self, method: str, start: str, budget: int) -> MethodSettings:
+        """With so many steps per demonstration, all told; AIRL in DMSRD gets what its rounds will leave."""
+        usual = {"clone": METHODS, "nothing": METHODS_FROM_NOTHING}[start][self.domain]
+        many, n, horizon = 100_000, len(self.users), get_domain(self.domain).horizon
+        a_round = usual.dmsrd.msrd.n_iterations * usual.dmsrd.msrd.episodes
+        own = usual.dmsrd.own_rollouts if method == "DMSRD" else 0
+        rounds = horizon * (a_round * sum(range(2, n + 1)) + own * sum(range(1, n + 1))) // n
+        longer: dict[str, Any] = {"n_iterations": many, "max_steps": budget}
+        for_new = replace(usual.dmsrd.airl, n_iterations=many, max_steps=budget - rounds)
+        return MethodSettings(
+            airl=replace(usual.airl, **longer),
+            msrd=replace(usual.msrd, **longer),
+            batch=replace(usual.batch, n_iterations=many, max_steps=budget * n),
+            dmsrd=replace(usual.dmsrd, airl=for_new),
+        )
+
+
+def _benchmark(domain: str, quick: bool) -> BenchmarkLesson:
+    few = _dmsrd(domain, True).loop
+    live = MethodSettings(
+        msrd=replace(few.msrd, n_iterations=6, episodes=4, cloning_steps=few.airl.cloning_steps), dmsrd=few
+    )
+    budgets = {PENDULUM: (100_000, 250_000, 500_000, 1_000_000), LANDER: (100_000, 250_000, 500_000)}[domain]
+    printed = {PENDULUM: (250_000, 500_000, 1_000_000), LANDER: (500_000,)}[domain]
+    users = (0, 1, 3) if quick else tuple(range(10))
+    from_clone = {PENDULUM: 300_000, LANDER: 150_000}[domain]
+    return BenchmarkLesson(domain, users, budgets, printed, 500_000, from_clone, live)
 
 
 @dataclass(frozen=True)
@@ -328,19 +390,18 @@ def _dmsrd(domain: str, quick: bool) -> DMSRDLesson:
     loop = METHODS[domain].dmsrd
     if not quick:
         halves = tuple(tuple((i in pair) / 2 for i in range(10)) for pair in ((0, 1), (2, 3), (3, 5)))
-        return DMSRDLesson(domain, tuple(range(10)), halves, loop)
+        return DMSRDLesson(domain, tuple(range(10)), halves, loop, _fresh(domain))
     airl = AIRLSettings(n_iterations=4, episodes=4, cloning_steps=1000, coverage_episodes=1)
     msrd = replace(loop.msrd, n_iterations=3, episodes=2, discriminator_steps=24)
     mixture = MixtureSettings(12, 8, n_finalists=3, from_actions=True)
     loop = replace(loop, airl=airl, msrd=msrd, mixture=mixture, own_rollouts=5)
-    return DMSRDLesson(domain, (0, 1, 3), ((0.5, 0.5, 0.0), (0.3, 0.0, 0.7)), loop)
+    return DMSRDLesson(domain, (0, 1, 3), ((0.5, 0.5, 0.0), (0.3, 0.0, 0.7)), loop, _fresh(domain))
 
 
 def _fresh(domain: str) -> TrainingSettings:
-    """On the pendulum long, and slower towards the end: too short a training looks like a reward that does
-    not teach. On the lander as its records were made."""
+    """Long, and slower towards the end: too short a training looks like a reward that does not teach."""
     if domain == LANDER:
-        return replace(TRAINING[domain], n_strategies=5, n_iterations=120, hold=0.5, growing=0.9)
+        return replace(TRAINING[domain], n_strategies=10, n_iterations=160, last_rate=0.1)
     return TrainingSettings(n_strategies=10, n_iterations=240, hold=0.75, growing=0.92, last_rate=0.1)
 
 
@@ -375,6 +436,7 @@ LESSONS: dict[str, Any] = {  # (domain, quick) -> settings
         MSRDSettings(n_iterations=9 if quick else 20, discriminator_steps=24, **_small(quick, 4)),
         {True: 10, False: 20 if domain == PENDULUM else 40}[quick]),
     "06_dmsrd": _dmsrd,
+    "07_benchmark": _benchmark,
     "08_lifelong_100": _lifelong,
 }  # fmt: skip
 

@@ -21,6 +21,8 @@ SHOWN = {
     "divergence_above_floor": "KL above the floor (nats)",
     "log_likelihood_above_own": "log-likelihood above the demonstrator's own (nats per step)",
     "sigma": "sigma",
+    "published_return": "return as published",
+    "published_log_likelihood": "log-likelihood as published",
     "pearson": "Pearson",
     "spearman": "Spearman",
     "spearman_of_good": "Spearman among those that do not fail",
@@ -29,7 +31,7 @@ SHOWN = {
     **{f"recognized_on_{k}": f"on {k} fresh takes" for k in (3, 10, 30)},
     "weight_error": "error of the weights",
 }
-NO_METRICS = ("curve", "curves", "decisions", "branches", "pure")
+NO_METRICS = ("curve", "curves", "decisions", "branches", "pure", "weights", "paid", "paid_shown")
 COLUMNS = ("record", "lesson", "domain", "seed", "method", "metric", "value")
 
 
@@ -64,6 +66,12 @@ def _numbers(record: dict, domain: Domain) -> Iterator[tuple[str, str, Any]]:
         return
     if "n_fresh" in r:
         yield from _recognition(r["table"])
+        return
+    if "scores" in r:  # lesson 07
+        known = [np.array(r["known"][name]) for name in ("floor", "own_log_likelihood")]
+        for method, by_budget in r["scores"].items():
+            for budget, scores in by_budget.items():
+                yield from _scores(f"{method}, {int(budget) / 1e6:g} M steps", scores, domain, *known)
         return
     floor, own = np.array(r["floor"]), np.array(r["own_log_likelihood"])
     yield "demonstrator", "divergence", floor

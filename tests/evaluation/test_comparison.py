@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tiny
+import torch
 from helpers import make_truth
 
 from dmsrd_lite.domains import InputError
@@ -64,6 +65,16 @@ def test_from_nothing_the_mean_of_functions_is_learned_and_stored(method, small_
     steps, *rewards = np.array(learned.curve).T
     assert steps.tolist() == [50, 100]
     assert len(rewards) == learned.policies.n_strategies
+
+
+def test_what_is_known_on_the_way_is_what_a_shorter_training_knows(small_set):
+    on_the_way = list(comparison.train_to("MSRD", small_set, FROM_NOTHING, 0, budgets=(20, 50, 10_000)))
+    assert [spent for spent, _ in on_the_way] == [50, 100]
+    short = replace(FROM_NOTHING, msrd=replace(FROM_NOTHING.msrd, n_iterations=1))
+    alone = train_method("MSRD", small_set, short, 0)
+    for name, kept in on_the_way[0][1].policies.state_dict().items():
+        assert torch.equal(kept, alone.policies.state_dict()[name]), name
+    assert len(on_the_way[0][1].curve) == 1
 
 
 def test_a_method_spends_what_its_settings_and_records_say(small_set):

@@ -112,3 +112,23 @@ def test_three_correlations_tell_a_reward_that_only_knows_who_failed(domain):
     assert whole[3] == pytest.approx(
         -np.mean(np.sum((states[3] / domain.observation_scale) ** 2, 1)), rel=1e-5
     )
+
+
+def test_the_authors_scores_by_hand(lander_set):
+    """Their sigma, their floor, all trajectories together, and rewards on every step."""
+    flown = dataclasses.replace(lander_set, domain=LUNAR_LANDER.on_threads(1))
+    actor = GaussianPolicies(LUNAR_LANDER, lander_set.n_demonstrations, 3).actor()
+    scores = metrics.published_scores(actor, flown, 5)
+    data = rollout(flown.domain, actor, 20, 5, horizon=lander_set.horizon)
+    assert np.array_equal(scores["published_return"], data.rewards_every_step.sum(-1).mean(1))
+    for j, (observations, actions) in enumerate(
+        zip(lander_set.observations, lander_set.actions, strict=True)
+    ):
+        total = 0.0
+        for states, acted in zip(observations, actions, strict=True):
+            mean = actor.select([j]).mean(states[None, :-1])[0]
+            density = np.prod(
+                np.exp(-(((acted - mean) / 0.0628) ** 2) / 2) / (0.0628 * np.sqrt(2 * np.pi)), -1
+            )
+            total += np.log(np.maximum(density, 1e-37)).sum()
+        assert scores["published_log_likelihood"][j] == pytest.approx(total, rel=1e-5)

@@ -239,6 +239,20 @@ def test_the_policy_learns_more_slowly_in_the_second_half(small_set):
     assert rates == pytest.approx([1, 1, 1, 0.6])
 
 
+def test_it_ends_when_its_steps_are_spent(small_set):
+    """The iteration that spends the last of them is the last, and the rate falls by steps."""
+    changes = {"n_iterations": 50, "episodes": 1, "coverage": "none", "last_rate": 0.2}
+    learner, rates = AIRL(small_set, replace(AIRL_ONE, **changes, max_steps=130), 0), []
+    steps = []
+    for record in learner.train():
+        steps.append(record["steps"])
+        rates.append(learner.optimizer.optimizer.param_groups[0]["lr"])
+    each = steps[0]
+    assert steps == [each * (i + 1) for i in range(-(-130 // each))]
+    assert rates[-1] < rates[0]
+    assert len(list(learner.train())) == 0
+
+
 def test_episodes_grow_when_the_discriminator_can_no_longer_tell(small_set):
     learner = AIRL(small_set, replace(AIRL_ONE, first_horizon=20, growth=1.5, grow_below=0.75), 0)
     for iteration in range(12):
@@ -300,6 +314,7 @@ def test_the_mean_of_iterates_is_of_functions_not_of_weights(small_set):
         ({"penalty_weight": -1.0}, "penalty_weight -1.0: expected a number of at least 0"),
         ({"entropy_weight": -0.1}, "entropy_weight -0.1: expected a number of at least 0"),
         ({"penalty_slope": 0.0}, "penalty_slope 0.0: expected a positive number"),
+        ({"max_steps": -1}, "max_steps -1: expected a number of steps, or 0 for no limit"),
         ({"growth": 0.9}, "growth 0.9 from first_horizon 0: expected a growth above 1 from"),
         ({"growth": 1.0, "first_horizon": 30}, "growth 1.0 from first_horizon 30: expected a growth above 1"),
         ({"policy_average": 1.5}, "policy_average 1.5: expected a share of at most 1"),

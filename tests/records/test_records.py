@@ -1,17 +1,23 @@
-"""Every record: its form, and the settings that made it."""
+"""Every record: its form, and the settings that made it; what it stored scores again as it says."""
 
 from itertools import islice
 
 import numpy as np
 import pytest
+import torch
 from records import stored
 
+from dmsrd_lite.demonstrators import people
 from dmsrd_lite.domains import DOMAINS
-from dmsrd_lite.evaluation import comparison
+from dmsrd_lite.evaluation import comparison, searches
 from dmsrd_lite.evaluation.metrics import reward_correlations, score_policies
 from dmsrd_lite.evaluation.worth import able
 from dmsrd_lite.learning.networks import under
 from dmsrd_lite.learning.policy_optimization import train_policies
+from dmsrd_lite.method.airl import clone_demonstrations
+from dmsrd_lite.method.between_class_discrimination import recognized
+from dmsrd_lite.method.policy_mixture import Mixtures
+from dmsrd_lite.method.rewards import Rewards
 from dmsrd_lite.workbook import presets
 from dmsrd_lite.workbook.records import RECORDS, settings_of
 
@@ -28,11 +34,16 @@ def test_a_record_is_small_and_says_what_made_it(name):
     assert record["name"] == name
     assert {"domain", "preset", "seed"} <= set(record["parameters"])
     assert {"torch", "mujoco", "python"} <= set(record["versions"])
-    assert holding(record["settings"], "discriminator_rate")["ppo"]["learning_rate"] > 0
+    trains = holding(record["settings"], "discriminator_rate")
+    assert name.startswith("04") or trains["ppo"]["learning_rate"] > 0
     assert (RECORDS / f"{name}.safetensors").stat().st_size < 1_000_000
 
 
-FROM_NOTHING = sorted(path.stem for path in RECORDS.glob("0[23]_*.json"))
+def of(pattern):
+    return sorted(path.stem for path in RECORDS.glob(f"{pattern}_*.json"))
+
+
+FROM_NOTHING = of("0[23]")
 
 
 def restored(name, method):
@@ -42,22 +53,31 @@ def restored(name, method):
     return comparison.restore(under(method, tensors), shown, record["results"].get("alpha", 0.0))
 
 
+def prepared(name):
+    """Of a record: itself, its networks, domain and seed."""
+    record, tensors = stored.record_of(name)
+    return record, tensors, DOMAINS[record["parameters"]["domain"]], record["parameters"]["seed"]
+
+
+def assert_policies_score(actor, shown, seed, known, label):
+    """As the record says, but for what rounding does to rollouts."""
+    scores = score_policies(actor, shown, [seed, 99])
+    likelihood = scores["log_likelihood_per_step"]
+    assert likelihood == pytest.approx(known["log_likelihood_per_step"], abs=stored.LIKELIHOOD), label
+    spared = np.equal(known["failure_share"], 0) & (scores["failure_share"] == 0)
+    close = np.abs(scores["divergence"] - known["divergence"]) < stored.DIVERGENCE
+    assert close[spared].sum() >= 0.9 * spared.sum(), f"{label}: of those that never fail"
+    n_able, n_known = (able(shown.domain, row).sum() for row in (scores, known))
+    assert abs(n_able - n_known) <= 1, f"{label}: one may fall here and not there"
+
+
 @pytest.mark.verify
 @pytest.mark.parametrize("name", FROM_NOTHING)
 def test_recorded_policies_score_again_as_recorded(name):
-    record, _ = stored.record_of(name)
-    domain = DOMAINS[record["parameters"]["domain"]]
-    shown, seed = stored.demonstrations(domain.name), record["parameters"]["seed"]
+    record, _, domain, seed = prepared(name)
     for method, known in record["results"]["table"].items():
         actor = restored(name, method).actor()
-        scores = score_policies(actor, shown, [seed, 99])
-        likelihood = scores["log_likelihood_per_step"]
-        assert likelihood == pytest.approx(known["log_likelihood_per_step"], abs=stored.LIKELIHOOD), method
-        spared = np.equal(known["failure_share"], 0) & (scores["failure_share"] == 0)
-        close = np.abs(scores["divergence"] - known["divergence"]) < stored.DIVERGENCE
-        assert close[spared].sum() >= 0.9 * spared.sum(), f"{method}: of those that never fail"
-        n_able, n_known = (able(domain, row).sum() for row in (scores, known))
-        assert abs(n_able - n_known) <= 1, f"{method}: one may fall here and not there"
+        assert_policies_score(actor, stored.demonstrations(domain.name), seed, known, method)
 
 
 @pytest.mark.verify
@@ -75,12 +95,12 @@ def test_recorded_rewards_correlate_again_as_recorded(name):
 
 
 @pytest.mark.verify
-@pytest.mark.parametrize("name", FROM_NOTHING)
+@pytest.mark.parametrize("name", FROM_NOTHING + of("06"))
 def test_fresh_policies_learn_again_as_recorded(name):
     """The whole training takes minutes; its first iterations, which depend on the reward, come back."""
-    record, _ = stored.record_of(name)
-    domain, seed = DOMAINS[record["parameters"]["domain"]], record["parameters"]["seed"]
-    fresh, part = presets.choose(name[:7], domain.name, "full").fresh, "task" if name[:2] == "03" else "g"
+    record, _, domain, seed = prepared(name)
+    lesson, part = "_".join(name.split("_")[:2]), "g" if name[:2] == "02" else "task"
+    fresh = presets.choose(lesson, domain.name, "full").fresh
     assert settings_of(fresh) == record["settings"]["fresh"]
     for label, known in record["results"]["worth"].items():
         assert np.shape(known["curves"]) == (fresh.n_iterations, fresh.n_strategies)
@@ -93,3 +113,67 @@ def test_fresh_policies_learn_again_as_recorded(name):
             steps = islice(train_policies(domain, paid, fresh, seed + 100), 3)
             again = [r["environment_return"] / r["horizon"] for r in steps]
             assert again == pytest.approx(np.array(known["curves"][:3]), abs=stored.FIRST_STEPS), label
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("name", of("04"))
+def test_weights_are_found_from_actions_as_recorded(name):
+    record, _, domain, seed = prepared(name)
+    settings, own_people = record["settings"], people.load_shipped_demonstrators(domain)
+    shown = stored.demonstrations(domain.name)
+    clones = clone_demonstrations(shown, [seed, 101], settings["cloning_steps"])[0].actor()
+    m, n = min(settings["n_known"]), settings["n_newcomers"]
+    some, nothing = np.random.default_rng([seed, 20, m]).permutation(10)[:m], {}
+    own_seed = [seed, 20, m]
+    again = [*searches.compare(nothing, own_people.select(some), clones.select(some), n, (), own_seed, 1)]
+    known = [r for r in record["results"]["rows"] if r["known"] == m and r["search"] == "likeliest actions"]
+    for key in ("error", "deviation"):
+        assert [r[key] for r in again] == pytest.approx([r[key] for r in known], abs=stored.WEIGHT)
+
+
+def means_on_takes(rewards, acting, domain, seed, n_fresh):
+    """Mean rewards (M, n) on so many fresh takes of everybody, by their number."""
+    return {k: rewards.mean_rewards(people.fresh_takes(acting, domain, k, [seed, 60, k])) for k in n_fresh}
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("name", of("05"))
+def test_recorded_strategy_rewards_recognise_again_as_recorded(name):
+    record, tensors, domain, seed = prepared(name)
+    settings, weights = record["settings"], np.array(record["results"]["weights"])
+    acting = Mixtures(people.load_shipped_demonstrators(domain).select(settings["users"]), weights)
+    test = stored.rewards_test_set(domain.name, "development_set")
+    for label, known in record["results"]["table"].items():
+        rewards = Rewards(domain, weights.shape[1], 0.99, 0, settings["msrd"]["alpha"])
+        kept = {k: torch.tensor(v) for k, v in under(label, tensors).items()}
+        rewards.load_state_dict(kept, strict=False)  # shaping is not kept
+        means = means_on_takes(rewards, acting, domain, seed, settings["n_fresh"])
+        for k, found in means.items():
+            count = recognized(found, range(weights.shape[1])).sum()
+            assert count == known["recognized"][f"{k} fresh"], f"{label}, {k} takes"
+        task = rewards.evaluate(test.observations, "task")[0].mean(1)
+        assert reward_correlations(test, task).pearson == pytest.approx(known["task"], abs=stored.CORRELATION)
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("name", of("06"))
+def test_recorded_runs_of_algorithm_1_score_again_as_recorded(name):
+    record, tensors, domain, seed = prepared(name)
+    settings, arrival = record["settings"], record["results"]["arrival"]
+    weights = np.vstack([np.eye(len(settings["users"])), settings["mixtures"]])
+    own_people = people.load_shipped_demonstrators(domain).select(settings["users"])
+    mixed = people.fresh_takes(Mixtures(own_people, settings["mixtures"]), domain, 3, [seed, 50])
+    shown = stored.demonstrations(domain.name).joined(mixed).select(arrival)
+    acting, test = Mixtures(own_people, weights[arrival]), stored.rewards_test_set(domain.name)
+    for label, known in record["results"]["table"].items():
+        n_strategies, alpha = len(known["pure"]), settings["loop"]["msrd"]["alpha"]
+        learned = comparison.restore(under(label, tensors), shown, alpha, known["pure"])
+        assert_policies_score(learned.actor(), shown, seed, known, label)
+        task = learned.rewards.evaluate(test.observations, "task")[0].mean(1)
+        assert reward_correlations(test, task).pearson == pytest.approx(
+            known["pearson"], abs=stored.CORRELATION
+        )
+        means = means_on_takes(learned.rewards, acting, domain, seed, settings["n_fresh"])
+        for k, found in means.items():
+            assert recognized(found, known["pure"]).sum() == known["recognized_fresh"][str(k)], label
+        assert n_strategies == learned.policies.n_strategies

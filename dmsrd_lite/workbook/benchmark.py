@@ -1,0 +1,348 @@
+"""Lesson 07's records: who was scored how at which budget, in one table, and what it says of a claim."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dmsrd_lite.domains import Domain, InputError
+from dmsrd_lite.evaluation.statistics import Ranks, compare_correlations, mean_interval, rank_methods
+from dmsrd_lite.evaluation.worth import able
+from dmsrd_lite.method.dmsrd import BETTER_MIXTURE, MIXTURE
+from dmsrd_lite.workbook.presets import BENCHMARK, BenchmarkLesson
+from dmsrd_lite.workbook.records import RECORDS, load_record, settings_of
+
+# Per demonstration: what it is called in a table, and whether more is better.
+Entry = tuple[str, str, int]  # method, start, budget
+METRICS = {
+    "environment_return": ("return", True),
+    "log_likelihood_per_step": ("log-likelihood", True),
+    "divergence": ("KL", False),
+}
+PUBLISHED = {"published_return": "return", "published_log_likelihood": "log-likelihood", "divergence": "KL"}
+CORRELATIONS = {"pearson": "Pearson", "spearman": "Spearman", "spearman_of_good": "Spearman of the good"}
+SHARED = ("AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD as printed", "DMSRD")  # one reward for all
+OURS, RIVALS = ("DMSRD as printed", "DMSRD"), ("AIRL Single", "MSRD")
+TRIALS = (0, 1, 2)
+
+# The paper's Table 1: environment return, log-likelihood, KL (as its authors scored them), and its Friedman
+# tests of these three.
+PAPER = {
+    "inverted_pendulum": {
+        "AIRL Single": (-172.7, -11546.0, 4.08),
+        "MSRD": (-166.4, -40870.5, 7.67),
+        "DMSRD as printed": (-38.5, -6525.0, 4.01),
+        "Friedman's Q(2)": (29.4, 16.8, 22.2),
+    },
+    "lunar_lander": {
+        "AIRL Single": (-11546.0, -15137.8, 71.4),
+        "MSRD": (-9895.3, -11124.2, 70.9),
+        "DMSRD as printed": (-2405.5, -6723.7, 79.9),
+        "Friedman's Q(2)": (7.8, 22.2, 2.4),
+    },
+}
+
+
+def record_name(domain: str, part: str, trial: int) -> str:
+    """Of the record of a part of one trial."""
+    return f"07_benchmark_{domain}_{part}_seed{trial}"
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """All that was scored: rows (trial, method, start, budget) -> scores; lists are per demonstration, in
+    the trial's order of arrival."""
+
+    domain: Domain
+    rows: dict[tuple[int, str, str, int], dict[str, Any]]
+    known: dict[int, dict[str, Any]]  # of each trial: arrival, floor, and the demonstrators' own scores
+
+    def budgets(self, method: str, start: str) -> list[int]:
+        return sorted({row[3] for row in self.rows if row[1:3] == (method, start)})
+
+    def per_trial(self, method: str, start: str, budget: int) -> list[dict[str, Any]]:
+        """The scores of every trial; ``InputError`` where the records do not hold this."""
+        trials = sorted(self.known)
+        found = [self.rows.get((trial, method, start, budget)) for trial in trials]
+        if any(row is None for row in found):
+            text = f"{method} from {start} was not scored at {budget:,} steps per demonstration"
+            held = ", ".join(f"{b:,}" for b in self.budgets(method, start)) or "nothing of it"
+            raise InputError(f"{text}; expected one of the budgets that the records hold: {held}")
+        return [row for row in found if row is not None]
+
+    def values(self, method: str, start: str, budget: int, metric: str) -> np.ndarray:
+        """One number for each demonstration of each trial: (trials * n,)."""
+        return np.concatenate([row[metric] for row in self.per_trial(method, start, budget)]).astype(float)
+
+    def difference(self, one: Entry, other: Entry, metric: str) -> tuple[float, float, float]:
+        """Mean of one method's minus another's, demonstration by demonstration, and its 95 % interval."""
+        gap = self.values(*one, metric) - self.values(*other, metric)
+        return float(gap.mean()), *mean_interval(gap)
+
+    def over_trials(self, entry: Entry, value: Callable[[dict[str, Any]], float]) -> list[float]:
+        """A number for each trial."""
+        return [float(value(row)) for row in self.per_trial(*entry)]
+
+
+def in_words(values: np.ndarray) -> str:
+    """Mean and 95 % bootstrap interval."""
+    low, high = mean_interval(values)
+    digits = 1 if abs(values.mean()) >= 10 else 2
+    return f"{values.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def collect(domain: Domain, trials: Iterator[tuple[int, dict[str, Any]]]) -> Benchmark:
+    """Trial numbers and results of records as one benchmark."""
+    rows: dict[tuple[int, str, str, int], dict[str, Any]] = {}
+    known: dict[int, dict[str, Any]] = {}
+    for trial, results in trials:
+        before = known.setdefault(trial, results["known"])
+        if before["arrival"] != results["known"]["arrival"]:
+            text = "parts that saw other orders of arrival"
+            raise InputError(f"trial {trial} has {text}; expected records of one run of the plan")
+        for name, by_budget in results["scores"].items():
+            method, start = name.split(", ")
+            rows |= {(trial, method, start, int(budget)): row for budget, row in by_budget.items()}
+    return Benchmark(domain, rows, known)
+
+
+def load(domain: Domain, settings: BenchmarkLesson, folder: Path = RECORDS) -> Benchmark:
+    """The committed records of all trials; ``InputError`` when one is missing or of other settings."""
+
+    def results() -> Iterator[tuple[int, dict[str, Any]]]:
+        for trial in TRIALS:
+            for part in BENCHMARK:
+                name = record_name(domain.name, part, trial)
+                if not (folder / f"{name}.json").exists():
+                    plan = f"papermill_runs/plans/benchmark_{domain.name}.toml"
+                    raise InputError(f"record {name} is missing; expected all trials: run {plan}")
+                record, _ = load_record(name, folder)
+                if record["settings"] != settings_of(settings):
+                    text = f"record {name} was made with other settings than this lesson's"
+                    raise InputError(f"{text}; expected records of one plan: run it again")
+                yield trial, record["results"]
+
+    return collect(domain, results())
+
+
+def verdict(difference: tuple[float, float, float], larger_is_better: bool) -> str:
+    """Of a difference to a rival with its interval (mean, low, high)."""
+    _, low, high = difference if larger_is_better else tuple(-x for x in (difference[0], *difference[:0:-1]))
+    return "holds" if low > 0 else "does not hold" if high < 0 else "a tie"
+
+
+def first_budget(holds: Callable[[int], str], budgets: Sequence[int]) -> str:
+    """A claim over the budget, in words: at which of them it holds."""
+    found = {budget: holds(budget) for budget in budgets}
+    where = [f"{budget / 1e6:g} M" for budget, text in found.items() if text == "holds"]
+    if len(where) == len(found):
+        return "holds"
+    ties = [f"{budget / 1e6:g} M" for budget, text in found.items() if text == "a tie"]
+    parts = [f"holds at {', '.join(where)} steps"] * bool(where) + [f"a tie at {', '.join(ties)}"] * bool(
+        ties
+    )
+    return "; ".join(parts) or "does not hold"
+
+
+def summary(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
+    """Table 1: for each method, start and budget the means over demonstrations and trials with their 95 %
+    intervals, and what the demonstrators reach themselves."""
+    table = {}
+    for method, start, budget in entries:
+        rows = found.per_trial(method, start, budget)
+        line = {title: in_words(found.values(method, start, budget, m)) for m, (title, _) in METRICS.items()}
+        line["do the task"] = f"{np.mean([able(found.domain, row).mean() for row in rows]):.0%}"
+        line["million steps each"] = f"{np.mean([row['spent'] for row in rows]) / 1e6:.2f}"
+        n = len(rows[0]["divergence"])
+        line["search"] = f"{np.mean([row['search_steps'] for row in rows]) / n / 1e6:.2f}"
+        table[f"{method}, {start}"] = line
+    own = {"return": "own_return", "log-likelihood": "own_log_likelihood", "KL": "floor"}
+    joined = {k: np.concatenate([one[name] for one in found.known.values()]) for k, name in own.items()}
+    table["the demonstrators"] = {k: in_words(values) for k, values in joined.items()}
+    return pd.DataFrame(table).T.fillna("")
+
+
+def as_published(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
+    """The same by the authors' scoring, beside the paper's numbers."""
+    table: dict[str, dict[str, Any]] = {}
+    for method, start, budget in entries:
+        line = {t: found.values(method, start, budget, m).mean().round(1) for m, t in PUBLISHED.items()}
+        paper = PAPER[found.domain.name].get(method, ("", "", ""))
+        theirs = {f"paper: {t}": value for t, value in zip(PUBLISHED.values(), paper, strict=True)}
+        table[f"{method}, {start}"] = line | theirs
+    own = {t: "floor" if t == "KL" else m for m, t in PUBLISHED.items()}
+    joined = {k: np.concatenate([one[name] for one in found.known.values()]) for k, name in own.items()}
+    table["the demonstrators"] = {k: values.mean().round(1) for k, values in joined.items()}
+    return pd.DataFrame(table).T.fillna("")
+
+
+def ranking(found: Benchmark, entries: Sequence[Entry], metric: str) -> str:
+    """Methods by their mean, the largest first."""
+    mean = {entry[0]: found.values(*entry, metric).mean() for entry in entries}
+    return " > ".join(sorted(mean, key=lambda method: -mean[method]))
+
+
+def rescued(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
+    """Whom line 11 of Algorithm 1 explained by a mixture, because AIRL did worse: the two KL, the KL in the
+    end, and AIRL Single's at the same budget."""
+    lines = []
+    for method, start, budget in entries:
+        single = budget in found.budgets("AIRL Single", start)
+        for trial, row in zip(sorted(found.known), found.per_trial(method, start, budget), strict=True):
+            for i, r in enumerate(row["decisions"]):
+                if r["branch"] == BETTER_MIXTURE:
+                    who = (f"{method}, {start}", trial, found.known[trial]["arrival"][i])
+                    alone = found.rows[trial, "AIRL Single", start, budget] if single else None
+                    other = alone["divergence"][i] if alone else np.nan
+                    lines.append([*who, r["kl_mix"], r["kl_new"], row["divergence"][i], other])
+    header = ["run", "trial", "person", "mixture", "dropped AIRL", "in the end", "AIRL Single"]
+    return pd.DataFrame(lines, columns=header).round(1)
+
+
+def ranks(found: Benchmark, entries: Sequence[Entry], metric: str) -> Ranks:
+    """The methods ranked within each person of each trial."""
+    table = [found.values(*entry, metric) for entry in entries]
+    return rank_methods(np.array(table).T, METRICS[metric][1])
+
+
+def friedman(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
+    """The paper's tests: AIRL Single, MSRD and DMSRD as printed, for each start and score."""
+    lines = {}
+    for start in dict.fromkeys(start for _, start, _ in entries):
+        three = [e for e in entries if e[1] == start and e[0] in (*RIVALS, OURS[0])]
+        if len(three) < 3:
+            continue
+        for k, (metric, (title, _)) in enumerate(METRICS.items()):
+            result = ranks(found, three, metric)
+            at = {e[0]: i for i, e in enumerate(three)}
+            p = {f"{m} - DMSRD": result.pairwise_p[at[m], at[OURS[0]]] for m in RIVALS}
+            told = {
+                "Q(2)": result.q,
+                "paper's Q": PAPER[found.domain.name]["Friedman's Q(2)"][k],
+                "p": result.p,
+            }
+            mean_ranks = {f"rank of {m}": result.mean_ranks[k] for m, k in at.items()}
+            lines[f"{title}, {start}"] = told | p | mean_ranks
+    return pd.DataFrame(lines).T.round(3)
+
+
+def correlations(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
+    """What each task reward knows of the true return; one number for each trial."""
+    table = {}
+    for entry in entries:
+        if "pearson" in found.per_trial(*entry)[0]:
+            numbers = {t: found.over_trials(entry, itemgetter(k)) for k, t in CORRELATIONS.items()}
+            line = {t: ", ".join(f"{x:.3f}" for x in values) for t, values in numbers.items()}
+            table[f"{entry[0]}, {entry[1]}"] = line
+    return pd.DataFrame(table).T
+
+
+def fisher(found: Benchmark, entries: Sequence[Entry], n: int) -> pd.DataFrame:
+    """Fisher's z of DMSRD's correlation against its rivals', trial by trial; ``n`` trajectories."""
+    lines = {}
+    for one in (e for e in entries if e[0] in OURS):
+        for other in (e for e in entries if e[1] == one[1] and e[0] in SHARED[:3]):
+            pairs = zip(*(found.over_trials(e, itemgetter("pearson")) for e in (one, other)), strict=True)
+            z = [compare_correlations(a, b, n, n)[0] for a, b in pairs]
+            lines[f"{one[0]} - {other[0]}, {one[1]}"] = dict(zip(sorted(found.known), z, strict=True))
+    return pd.DataFrame(lines).T.round(1)
+
+
+def recognition(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
+    """The share of strategy rewards that rank their own person first, by the takes they are asked on."""
+    table = {}
+    for entry in entries:
+        rows = found.per_trial(*entry)
+        if "recognized_fresh" in rows[0]:
+            takes = rows[0]["recognized_fresh"]
+            shares = {k: np.mean([r["recognized_fresh"][k] / len(r["pure"]) for r in rows]) for k in takes}
+            table[f"{entry[0]}, {entry[1]}"] = {k: f"{share:.0%}" for k, share in shares.items()}
+    return pd.DataFrame(table).T
+
+
+def cost(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
+    """What was created, which branches were taken, and what it took; one number for each trial, or means."""
+    table = {}
+    for entry in entries:
+        rows = found.per_trial(*entry)
+        counts = {
+            "strategies": [len(row["pure"]) for row in rows],
+            "mixtures": [sum(r["branch"] == MIXTURE for r in row["decisions"]) for row in rows],
+            "by line 11": [sum(r["branch"] == BETTER_MIXTURE for r in row["decisions"]) for row in rows],
+        }
+        line = {k: ", ".join(map(str, v)) if rows[0]["decisions"] else "" for k, v in counts.items()}
+        for title, key, unit in (
+            ("million steps", "steps", 1e6),
+            ("million search steps", "search_steps", 1e6),
+            ("minutes", "seconds", 60),
+        ):
+            line[title] = f"{np.mean([row[key] for row in rows]) / unit:.2f}"
+        table[f"{entry[0]}, {entry[1]}"] = line
+    return pd.DataFrame(table).T
+
+
+def newcomers(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
+    """What a person costs at arrival: explained by a mixture, or AIRL trained; and who does the task in the
+    end."""
+    lines = []
+    for method, start, budget in entries:
+        for row in found.per_trial(method, start, budget):
+            can = able(found.domain, row)
+            for i, r in enumerate(row["decisions"]):
+                how = "AIRL trained" if r["steps"]["airl"] else "a mixture"
+                spent = r["steps"]["search"] / 1e3, r["steps"]["airl"] / 1e3
+                lines.append([f"{method}, {start}", how, *spent, float(i in row["pure"]), can[i]])
+    header = ["run", "explained", "thousand search steps", "thousand AIRL steps", "pure", "does the task"]
+    table = pd.DataFrame(lines, columns=header)
+    people = table.groupby(["run", "explained"]).size().rename("people")
+    return pd.concat([people, table.groupby(["run", "explained"]).mean(numeric_only=True)], axis=1).round(2)
+
+
+def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:
+    """The paper's claims that can be tested here, from the records; ``most`` fresh takes for claim 4."""
+
+    def known(row: dict[str, Any]) -> float:
+        return row["recognized_fresh"][str(most)] / len(row["pure"])
+
+    def best_rival(start: str, budget: int, metric: str) -> Entry:
+        sign = 1 if METRICS[metric][1] else -1
+        rivals: list[Entry] = [(rival, start, budget) for rival in RIVALS]
+        return max(rivals, key=lambda e: sign * found.values(e[0], e[1], e[2], metric).mean())
+
+    lines = []
+    for entry in (e for e in entries if e[0] in OURS):
+        method, start, budget = entry
+        there = {e[0]: e for e in entries if e[1] == start}
+        for number, (metric, (title, larger)) in zip("12-", METRICS.items(), strict=True):
+            if not set(RIVALS) <= set(there):
+                continue
+
+            def told(b: int, metric: str = metric, larger: bool = larger, e: Entry = entry) -> str:
+                other = best_rival(e[1], b, metric)
+                return verdict(found.difference((e[0], e[1], b), other, metric), larger)
+
+            rival = best_rival(start, budget, metric)
+            gap = found.difference(entry, rival, metric)
+            shared = [b for b in found.budgets(method, start) if b in found.budgets(RIVALS[0], start)]
+            numbers = f"{gap[0]:+.2f} [{gap[1]:+.2f}, {gap[2]:+.2f}] against {rival[0]}"
+            over = first_budget(told, shared)
+            lines.append([number, f"{method}, {start}", f"better {title}", told(budget), numbers, over])
+        for number, claim, other, value in (
+            ("3", "stronger correlation", "AIRL Batch", itemgetter("pearson")),
+            ("3", "stronger correlation", "MSRD", itemgetter("pearson")),
+            ("4", "more strategies recognised", "MSRD", known),
+            ("4", "more strategies recognised", "DMSRD without BCD", known),
+            ("5", "BCD: stronger correlation", "DMSRD without BCD", itemgetter("pearson")),
+        ):
+            if other in there:
+                pairs = zip(*(found.over_trials(e, value) for e in (entry, there[other])), strict=True)
+                gaps = [a - b for a, b in pairs]
+                numbers = ", ".join(f"{gap:+.3f}" for gap in gaps) + f" against {other}"
+                told_by_trials = verdict((0.0, min(gaps), max(gaps)), True)
+                lines.append([number, f"{method}, {start}", claim, told_by_trials, numbers, ""])
+    header = ["claim", "method", "says", "verdict", "difference", "over the budget"]
+    return pd.DataFrame(lines, columns=header).set_index("claim")

@@ -1,0 +1,123 @@
+"""Lesson 07's table: made of whole benchmarks only, and verdicts by hand."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from dmsrd_lite.domains import INVERTED_PENDULUM, InputError
+from dmsrd_lite.workbook import benchmark, presets
+from dmsrd_lite.workbook.records import save_record
+
+LESSON = presets.choose("07_benchmark", "inverted_pendulum", "full")
+KNOWN = {"floor": [1.0, 2.0], "own_return": [-1.0, -2.0], "own_log_likelihood": [0.1, 0.2]}
+
+
+def row(returns, **others):
+    """Scores of two demonstrations."""
+    scores = {
+        "environment_return": returns, "failure_share": [0, 0], "divergence": [1.5, 2.5], "spent": 500_000,
+        "log_likelihood_per_step": [0.0, 0.1], "search_steps": 0,
+    }  # fmt: skip
+    return {**scores, **others}
+
+
+def trial(better, arrival=(0, 1), method="DMSRD"):
+    scores = {f"{method}, nothing": {"250000": row([-9.0, -8.0]), "500000": row(list(better))}}
+    return {"known": {**KNOWN, "arrival": list(arrival)}, "scores": scores}
+
+
+def everything(**changes):
+    trials = [(k, trial((-3.0 - k, -2.0))) for k in (0, 1)]
+    trials += [(k, trial((-4.0, -4.0), method="MSRD", **changes)) for k in (0, 1)]
+    return benchmark.collect(INVERTED_PENDULUM, iter(trials))
+
+
+def test_values_follow_trials_and_demonstrations():
+    found = everything()
+    assert found.budgets("DMSRD", "nothing") == [250_000, 500_000]
+    values = found.values("DMSRD", "nothing", 500_000, "environment_return")
+    assert values.tolist() == [-3, -2, -4, -2]
+    pair = [(method, "nothing", 500_000) for method in ("DMSRD", "MSRD")]
+    mean, low, high = found.difference(*pair, "environment_return")
+    assert mean == np.mean([1, 2, 0, 2])
+    assert low < mean < high
+    table = benchmark.summary(found, pair)
+    assert table.loc["DMSRD, nothing", "return"].startswith("-2.75 [")
+    assert table.loc["the demonstrators", "KL"].startswith("1.50 [")
+    assert table.loc["DMSRD, nothing", "million steps each"] == "0.50"
+
+
+def test_a_budget_that_no_record_holds():
+    with pytest.raises(InputError, match=r"^DMSRD from nothing was not scored at 100,000 steps per demonstr"):
+        everything().per_trial("DMSRD", "nothing", 100_000)
+    with pytest.raises(
+        InputError, match=r"expected one of the budgets that the records hold: nothing of it$"
+    ):
+        everything().per_trial("cloning", "clone", 0)
+
+
+def test_parts_of_different_runs_are_refused():
+    with pytest.raises(InputError, match=r"^trial 0 has parts that saw other orders of arrival; expected"):
+        everything(arrival=(1, 0))
+
+
+def save(folder, part, k, settings=LESSON):
+    parameters = {"domain": "inverted_pendulum", "preset": "full", "seed": k}
+    name = benchmark.record_name("inverted_pendulum", part, k)
+    save_record(name, parameters, settings, trial((-1.0, -1.0), method=part), {}, folder)
+    return folder / f"{name}.json"
+
+
+def test_records_are_read_whole_or_not_at_all(tmp_path):
+    files = [save(tmp_path, part, k) for part in presets.BENCHMARK for k in benchmark.TRIALS]
+    found = benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
+    assert sorted(found.known) == list(benchmark.TRIALS)
+    assert len(found.rows) == 2 * len(files)
+    other = dataclasses.replace(LESSON, main=250_000)
+    with pytest.raises(
+        InputError, match=r"clone_seed0 was made with other settings than this lesson's; expec"
+    ):
+        benchmark.load(INVERTED_PENDULUM, other, tmp_path)
+    assert json.loads(files[-1].read_text())["parameters"]["seed"] == 2
+    files[-1].unlink()
+    with pytest.raises(
+        InputError, match=r"printed_seed2 is missing; expected all trials: run papermill_runs/"
+    ):
+        benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("difference", "larger", "expected"),
+    [
+        ((2.0, 1.0, 3.0), True, "holds"),
+        ((2.0, 1.0, 3.0), False, "does not hold"),
+        ((-2.0, -3.0, -1.0), False, "holds"),
+        ((0.5, -1.0, 3.0), True, "a tie"),
+        ((0.5, -1.0, 3.0), False, "a tie"),
+    ],
+)
+def test_a_verdict_asks_for_the_whole_interval(difference, larger, expected):
+    assert benchmark.verdict(difference, larger) == expected
+
+
+def test_a_verdict_over_the_budget():
+    told = {100_000: "holds", 250_000: "a tie", 1_000_000: "does not hold"}
+    assert benchmark.first_budget(told.get, list(told)) == "holds at 0.1 M steps; a tie at 0.25 M"
+    assert benchmark.first_budget(told.get, [1_000_000]) == "does not hold"
+    assert benchmark.first_budget(told.get, [100_000]) == "holds"
+
+
+def test_everybody_from_nothing_gets_the_same_steps():
+    """DMSRD's AIRL and its rounds together spend what AIRL and MSRD spend, a batch that of ten."""
+    for method in ("AIRL Single", "MSRD", "AIRL Batch", "DMSRD as printed", "DMSRD"):
+        chosen = LESSON.methods(method, "nothing", 500_000)
+        assert chosen.airl.max_steps == chosen.msrd.max_steps == 500_000
+        assert chosen.batch.max_steps == 5_000_000
+        loop, strategies = chosen.dmsrd, range(2, 11)
+        a_round = loop.msrd.n_iterations * loop.msrd.episodes * 1000
+        spent = [a_round * m for m in strategies]
+        if method == "DMSRD":
+            spent += [loop.own_rollouts * 1000 * n for n in range(1, 11)]
+        assert loop.airl.max_steps + sum(spent) / 10 == 500_000
