@@ -1,4 +1,4 @@
-"""Command line: ``python -m dmsrd_lite {generate,validate,run,results,bench,gallery,lab}``."""
+"""Command line: ``python -m dmsrd_lite {generate,validate,run,results,bench,gallery,classroom,lab}``."""
 
 import argparse
 import json
@@ -81,6 +81,23 @@ def _gallery(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _classroom(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from dmsrd_lite.workbook import classroom
+
+    if arguments.step == "release":
+        print(*classroom.release(arguments.course, arguments.lesson), sep="\n")
+    elif arguments.step == "grade":
+        bar = partial(tqdm, desc="submissions")
+        print(classroom.grade(arguments.course, arguments.submissions, bar).read_text(), end="")
+    elif arguments.step == "report":
+        print(classroom.report(arguments.course).read_text(), end="")
+    else:
+        print(*classroom.write_copies(), sep="\n")
+    return 0
+
+
 def _lab(arguments: argparse.Namespace) -> int:
     from dmsrd_lite.workbook.lab import open_lab
 
@@ -139,6 +156,18 @@ def _parser() -> argparse.ArgumentParser:
         "gallery", _gallery, "take the figures of the gallery out of a folder of executed notebooks"
     )
     gallery.add_argument("folder")
+    classroom = command("classroom", _classroom, "hand out the exercises, grade them, report")
+    steps = classroom.add_subparsers(dest="step", required=True)
+    release = steps.add_parser("release", help="make a course: copies for students, under COURSE/release")
+    release.add_argument("course", help="a new folder, or a course made before")
+    release.add_argument("--lesson", action="append", default=[], help="only this one (again for more)")
+    grade = steps.add_parser("grade", help="grade a folder of submissions: points, hints, pages for students")
+    grade.add_argument("course")
+    grade.add_argument("submissions", help="a folder with STUDENT/LESSON.ipynb for each student")
+    steps.add_parser(
+        "report", help="the table of points again, after a teacher has read the open answers"
+    ).add_argument("course")
+    steps.add_parser("copies", help="make the copies beside the lessons anew from the solutions")
     lab = command("lab", _lab, "JupyterLab on a copy of the lessons that is yours")
     lab.add_argument("--root", action="store_true", help="as root, which JupyterLab refuses otherwise")
     return parser  # fmt: skip

@@ -12,7 +12,8 @@ from dmsrd_lite.workbook.lessons import NOTEBOOKS, lessons
 from dmsrd_lite.workbook.presets import KNOBS
 from dmsrd_lite.workbook.records import ROOT
 
-EXERCISES = sorted(NOTEBOOKS.glob("exercises/*/*.ipynb"))
+EXERCISES = sorted(NOTEBOOKS.glob("exercises/solutions/*/*.ipynb"))
+COPIES = sorted(NOTEBOOKS.glob("exercises/0*/*.ipynb"))  # for students
 SECTIONS = ("**Question.**", "**You will be able to**", "**Needs.**", "**Time.**", "**Predict first.**",
             "**Break it", "## What we claim", "## What this does not show", "## Go on")  # fmt: skip
 LINK = r"(?<!!)\[[^\]]*\]\(([^)#]+)[^)]*\)"
@@ -114,7 +115,10 @@ def test_every_figure_is_explained_fits_the_page_and_keeps_the_colours(lesson):
     assert_none(colours, f"{lesson.name}: take figures.INK, figures.INKS[k] or figures.strategy_style(k)")
 
 
-@pytest.mark.parametrize("path", [*lessons(), *EXERCISES, NOTEBOOKS / "START.md"], ids=name)
+TEXTS = [NOTEBOOKS / "START.md", NOTEBOOKS / "README.md"]
+
+
+@pytest.mark.parametrize("path", [*lessons(), *COPIES, *TEXTS], ids=name)
 def test_links_lead_somewhere(path):
     text = path.read_text() if path.suffix == ".md" else Lesson(path).text
     broken = [link for link in re.findall(LINK, text) if not (path.parent / link).exists()]

@@ -15,15 +15,16 @@ from dmsrd_lite.method.divergence import policy_divergences
 from dmsrd_lite.method.kl_threshold import calibrate_threshold
 from dmsrd_lite.method.msrd import MSRDSettings
 from dmsrd_lite.method.policy_mixture import MixtureSettings, search_mixture
-from dmsrd_lite.method.rewards import Rewards
+from dmsrd_lite.method.rewards import Rewards, reward_as_task
 from dmsrd_lite.method.rounds import play_round
 from dmsrd_lite.method.state import State
 
 MIXTURE, BETTER_MIXTURE, NEW_STRATEGY = "mixture", "mixture, better than a new strategy", "new strategy"
 
 AS_PRINTED: dict[str, Any] = {
-    "add_task_reward": False, "between_class": "mixtures", "own_rollouts": 0, "search_again": False,
-    "policies_after_mixture": True, "from_actions": False,
+    "add_task_reward": False, "task_from_first": False, "between_class": "mixtures", "own_rollouts": 0,
+    "search_again": False, "policies_after_new": True, "policies_after_mixture": True,
+    "from_actions": False,
 }  # fmt: skip
 
 
@@ -34,6 +35,7 @@ class DMSRDSettings:
     )
     kl_margin: float = 0.5  # nats above the reference (``kl_threshold.reference_divergence``)
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
+    task_from_first: bool = True  # R_Task starts as the first person's reward (the paper: as nothing)
     between_class: str = "always"  # Equation 4 after every branch, after "mixtures" only (the paper), "never"
     own_rollouts: int = 20  # it is asked on so many of each person's explanation from new starts; 0: on what
     # was shown (the paper)
@@ -41,9 +43,8 @@ class DMSRDSettings:
     airl: AIRLSettings = AIRLSettings(n_iterations=12)
     msrd: MSRDSettings = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=24)  # a round
     mixture: MixtureSettings = MixtureSettings()
-    policies_after_mixture: bool = (
-        True  # policies learn in the round after a mixture, too (the paper), or only rewards
-    )
+    policies_after_new: bool = True  # policies learn in the round after a new strategy (the paper) ...
+    policies_after_mixture: bool = True  # ... and in that after a mixture (the paper), or only rewards do
     remembered: int = 0  # how many earlier mixtures a round works on (``rounds.remembered``); 0: all
     measured_rollouts: int = 10  # for the KL before and after a round
     audit_every: int = 0  # measure KL and recognition of all demonstrations after every so many; 0: never
@@ -119,7 +120,10 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
             branch, known = BETTER_MIXTURE, state.explained(new, fit.weights)  # 12: keep w, no new strategy
         else:  # 14
             branch = NEW_STRATEGY
-            known = state.with_strategy(new, candidate().networks())  # 15, 16: w = e_M+1, M = M + 1, m_M = i
+            networks = candidate().networks()
+            if s.task_from_first and not state.n_strategies:
+                networks = reward_as_task(networks, state.alpha)
+            known = state.with_strategy(new, networks)  # 15, 16: w = e_M+1, M = M + 1, m_M = i
     decision = {"demonstration": n, "branch": branch, "kl_mix": kl_mix, "kl_new": kl_new, "threshold": eps}
     decision |= {"reference": reference, "weights": known.weights[n], "n_strategies": known.n_strategies}
     created = branch == NEW_STRATEGY

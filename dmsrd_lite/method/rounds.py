@@ -28,7 +28,7 @@ def play_round(
     s, newest, pure = settings, len(state.weights) - 1, state.pure
     some = remembered(state, s.remembered, [*seed, 6])
     thresholds = np.array([*(r["threshold"] for r in state.records), threshold])[some]
-    moving = s.policies_after_mixture or created  # else policies rest, and nobody's KL can change
+    moving = s.policies_after_new if created else s.policies_after_mixture  # else no KL can change
     steps = {"search": 0, "msrd": 0, "between_class": 0}
     searched: dict[int, list[float]] = {}
 

@@ -47,7 +47,7 @@ def copy_lessons(folder: Path = MINE) -> str:
     """Copy the lessons once, never over what is there; says in a sentence where they are."""
     if folder.exists():
         return f"{folder}: your copy of the lessons, as you left it (move it away to get a fresh one)"
-    ignored = shutil.ignore_patterns(".ipynb_checkpoints", "ruff.toml")
+    ignored = shutil.ignore_patterns(".ipynb_checkpoints", "ruff.toml", "solutions")
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".copy-") as beside:  # whole, or not at all
         shutil.copytree(NOTEBOOKS, Path(beside) / "notebooks", ignore=ignored).rename(folder)
     return f"{folder}: your own copy of the lessons, ignored by git; notebooks/ stays as it is"

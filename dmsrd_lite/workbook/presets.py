@@ -111,10 +111,11 @@ _DMSRD_FROM_NOTHING = {PENDULUM: 130, LANDER: 110}  # iterations of AIRL on a ne
 
 
 def _round_from_nothing(domain: str, usual: MSRDSettings) -> MSRDSettings:
-    """Whole episodes, at the rate that AIRL ended with."""
+    """Whole episodes, at the rate that AIRL ended with; a strategy's reward is as quick as AIRL's own."""
     ppo = replace(_FROM_NOTHING[domain]["ppo"], learning_rate=1e-4)
     changes = {"first_horizon": 0, "coverage": "none", "policy_average": 0.0, "n_iterates": 0, "ppo": ppo}
     changes |= {"n_iterations": usual.n_iterations, "episodes": usual.episodes, "last_rate": 1.0}
+    changes |= {"alpha": 1.0, "between_class_weight": 1.0}
     return from_nothing(domain, usual, **changes)
 
 
@@ -125,6 +126,8 @@ METHODS_FROM_NOTHING = {
             usual.dmsrd,
             airl=from_nothing(name, AIRLSettings(), n_iterations=_DMSRD_FROM_NOTHING[name]),
             msrd=_round_from_nothing(name, usual.dmsrd.msrd),
+            policies_after_new=False,  # no cloning term would hold them near their demonstrations
+            policies_after_mixture=False,
         ),
         airl=from_nothing(name, AIRLSettings()),
         msrd=from_nothing(name, MSRDSettings(), **_MSRD_FROM_NOTHING[name]),
@@ -283,10 +286,12 @@ class DMSRDLesson:  # 06
     def ablations(self) -> dict[str, DMSRDSettings]:
         """Ours from a clone, with one deviation from the paper taken back at a time."""
         printed = self.loop.as_printed()
-        names = "add_task_reward", "between_class", "own_rollouts", "search_again"
+        names = "add_task_reward", "task_from_first", "between_class", "own_rollouts", "search_again"
         found = {f"{name} as printed": replace(self.loop, **{name: getattr(printed, name)}) for name in names}
         by_states = replace(self.loop, mixture=replace(self.loop.mixture, from_actions=False))
         found["from_actions as printed"] = by_states
+        moving = replace(self.forms["ours, nothing"], policies_after_new=True, policies_after_mixture=True)
+        found["policies learn in rounds, nothing"] = moving
         return found | {"without BCD": replace(self.loop, between_class="never")}
 
 

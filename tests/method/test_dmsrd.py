@@ -13,6 +13,7 @@ from tiny import GENEROUS, PENDULUM, ROUGH, TINY, after, assert_same, copied, ev
 
 from dmsrd_lite.domains import LUNAR_LANDER, InputError
 from dmsrd_lite.method import airl, divergence, dmsrd, kl_threshold, rounds
+from dmsrd_lite.method.rewards import reward_as_task
 from dmsrd_lite.method.state import State
 
 WITHOUT_COVERAGE = {name: replace(getattr(ROUGH, name), coverage="none") for name in ("airl", "msrd")}
@@ -48,8 +49,8 @@ def test_the_first_demonstration_makes_the_first_strategy(three, monkeypatch):
         "new strategy", None, [1.0], [True]]  # fmt: skip
     assert record["steps"] == {"search": 0, "airl": 50 + 3 * 50, "msrd": 0, "between_class": 0}
     assert (state.weights.tolist(), state.pure, state.n_strategies) == ([[1.0]], (0,), 1)
-    assert same(state.networks, made[0]["learner"].networks())
-    assert not state.rewards().evaluate(three.observations, "task").any()
+    assert same(state.networks, reward_as_task(made[0]["learner"].networks(), TINY.msrd.alpha))
+    assert not state.rewards().evaluate(three.observations, "g").any()
 
 
 @pytest.mark.parametrize(
@@ -208,14 +209,27 @@ def test_a_state_goes_on_in_the_form_that_made_it(three, states):
 
 
 def test_as_printed_takes_every_deviation_back():
-    printed = replace(TINY, own_rollouts=5, remembered=2, policies_after_mixture=False).as_printed()
+    rest = {"policies_after_new": False, "policies_after_mixture": False}
+    printed = replace(TINY, own_rollouts=5, remembered=2, **rest).as_printed()
     assert printed.form == "from clone with coverage, as printed"
     assert (printed.between_class, printed.own_rollouts, printed.remembered) == ("mixtures", 0, 0)
+    assert printed.policies_after_new
     assert printed.policies_after_mixture
-    off = printed.add_task_reward, printed.search_again, printed.mixture.from_actions
-    assert off == (False, False, False)
+    off = printed.add_task_reward, printed.task_from_first, printed.search_again, printed.mixture.from_actions
+    assert off == (False, False, False, False)
     assert not printed.msrd.between_class_relative
     assert printed.airl == TINY.airl
+
+
+def test_the_task_reward_starts_as_the_first_persons_reward(three, states):
+    """R_1 is what AIRL learned, all of it in R_Task; as printed R_Task is nothing yet."""
+    printed = after(State(PENDULUM, 0), three.select([0]), TINY.as_printed())
+    seen, first = three.observations, states[1].rewards()
+    assert np.abs(first.evaluate(seen, "task")).min() > 0
+    assert np.abs(first.evaluate(seen, "g")).max() == 0
+    assert np.abs(printed.rewards().evaluate(seen, "task")).max() == 0
+    total = (one.evaluate(seen, "total") for one in (first, printed.rewards()))
+    np.testing.assert_allclose(*total, atol=1e-3)
 
 
 def test_same_seed_same_bits_for_any_number_of_threads(three, states):

@@ -1,0 +1,217 @@
+"""A course made of the exercises: hand out, grade, report. Thin, over nbgrader.
+
+A course is a folder in nbgrader's own layout, with its settings in it: every command of nbgrader works there
+as well.
+"""
+
+import logging
+import os
+import shutil
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import nbformat
+import pandas as pd
+
+from dmsrd_lite.domains import InputError
+from dmsrd_lite.workbook.lessons import NOTEBOOKS
+
+SOLUTIONS = NOTEBOOKS / "exercises" / "solutions"
+SETTINGS = '''"""nbgrader's settings of a course with the exercises of dmsrd_lite."""
+
+c = get_config()
+c.CourseDirectory.course_id = "dmsrd_lite"
+c.ClearSolutions.code_stub = {"python": 'raise NotImplementedError("not yet")'}
+c.ClearSolutions.text_stub = "*Your answer.*"
+c.Execute.timeout = 10  # seconds of a cell: an endless loop costs its own task only
+'''
+
+
+class Submission(NamedTuple):
+    student: str
+    lesson: str
+    path: Path
+
+
+def lessons_with_exercise() -> list[str]:
+    return sorted(path.parent.name for path in SOLUTIONS.glob("*/*.ipynb"))
+
+
+def release(course: str | Path, lessons: Sequence[str] = ()) -> list[Path]:
+    """Copies for students of the exercises of ``lessons`` (default: all), under ``course/release``."""
+    course, known = Path(course).resolve(), lessons_with_exercise()
+    for lesson in lessons:
+        if lesson not in known:
+            raise InputError(f"{lesson} has no exercise; expected one of {', '.join(known)}")
+    settings = course / "nbgrader_config.py"
+    if course.is_dir() and any(course.iterdir()) and not settings.exists():
+        raise InputError(
+            f"{course} is not empty and not a course; expected a new folder, or one made by release"
+        )
+    course.mkdir(parents=True, exist_ok=True)
+    if not settings.exists():
+        settings.write_text(SETTINGS)
+    written = []
+    for lesson in lessons or known:
+        shutil.copytree(SOLUTIONS / lesson, course / "source" / lesson, dirs_exist_ok=True)
+        _expect(_nbgrader(course).generate_assignment(lesson), f"{lesson} could not be released")
+        written.append(course / "release" / lesson / f"{lesson}.ipynb")
+    return written
+
+
+def write_copies() -> list[Path]:
+    """The copies for students beside the lessons, made anew from the solutions."""
+    written = []
+    with tempfile.TemporaryDirectory() as folder:
+        for path in release(Path(folder) / "course"):
+            place = SOLUTIONS.parent / path.stem
+            place.mkdir(exist_ok=True)
+            written.append(Path(shutil.copyfile(path, place / path.name)))
+    return written
+
+
+def find_submissions(folder: str | Path) -> tuple[list[Submission], list[dict[str, str]]]:
+    """Notebooks under ``folder`` by student and lesson, and a note for each that cannot be taken.
+
+    A notebook has its lesson's name; the student's is that of its folder (above a folder of the lesson's
+    name, as nbgrader lays them).
+    """
+    folder = Path(folder).resolve()
+    paths = [p for p in sorted(folder.rglob("*.ipynb")) if ".ipynb_checkpoints" not in p.parts]
+    if not paths:
+        raise InputError(f"{folder}: no notebook in it; expected STUDENT/LESSON.ipynb for each student")
+    known, taken, notes = lessons_with_exercise(), defaultdict(list), []
+    for path in paths:
+        home, lesson = path.parent, path.stem
+        home = home.parent if home.name in known and home != folder else home
+        student = home.name if home != folder else "?"
+        if lesson not in known:
+            text = f"{path.name} is no exercise; expected the name of one, as {known[0]}.ipynb"
+            notes.append({"student": student, "lesson": "", "note": text})
+        elif student == "?":
+            text = f"{path.name} lies beside the students' folders; expected it in one of them"
+            notes.append({"student": student, "lesson": lesson, "note": text})
+        else:
+            taken[student, lesson].append(path)
+    found = []
+    for (student, lesson), several in taken.items():
+        if len(several) > 1:
+            where = " and ".join(str(path.parent.relative_to(folder)) for path in several)
+            text = f"handed in {len(several)} times, in {where}; expected once"
+            notes.append({"student": student, "lesson": lesson, "note": text})
+        else:
+            found.append(Submission(student, lesson, several[0]))
+    return found, notes
+
+
+def inspect(path: Path) -> tuple[str, bool]:
+    """What is unusual about a submitted notebook, in words ("" for nothing), and whether it can be graded."""
+    try:
+        notebook = nbformat.read(path, 4)
+    except Exception as error:
+        return f"does not open as a notebook ({type(error).__name__})", False
+    cells = [cell.metadata.get("nbgrader", {}).get("grade_id") for cell in notebook.cells]
+    cells = [name for name in cells if name]
+    if not cells:
+        return "holds no task of the exercise; expected the copy that was handed out", False
+    notes = []
+    if doubles := sorted({name for name in cells if cells.count(name) > 1}):
+        notes.append(f"the cell {', '.join(doubles)} is there more than once; the first one is graded")
+    kernel = notebook.metadata.get("kernelspec", {}).get("name", "none")
+    if kernel != "python3":
+        notes.append(f"asks for the kernel {kernel}; graded with python3")
+    return "; ".join(notes), True
+
+
+def _without_doubles(path: Path) -> nbformat.NotebookNode:
+    """A submission in which each task's cell is the first of its name; what is there again is plain code."""
+    notebook, seen = nbformat.read(path, 4), set()
+    for cell in notebook.cells:
+        name = cell.metadata.get("nbgrader", {}).get("grade_id")
+        if name in seen:
+            del cell.metadata["nbgrader"]
+        seen |= {name} - {None}
+    return notebook
+
+
+def grade(course: str | Path, submissions: str | Path, progress: Callable = iter) -> Path:
+    """Grade every notebook under ``submissions``; the table of ``report``."""
+    course = _course(course)
+    found, notes = find_submissions(submissions)
+    os.environ["PYTHONWARNINGS"] = "ignore"  # nbgrader takes a warning for a wrong answer
+    api = _nbgrader(course)
+    for student, lesson, path in progress(found):
+        text, gradable = inspect(path)
+        if gradable and not (course / "release" / lesson).is_dir():
+            text, gradable = "was not released in this course", False
+        if gradable:
+            place = course / "submitted" / student / lesson
+            shutil.rmtree(place, ignore_errors=True)
+            place.mkdir(parents=True)
+            nbformat.write(_without_doubles(path), place / f"{lesson}.ipynb")
+            answer = api.autograde(lesson, student)
+            if answer["success"]:
+                api.generate_feedback(lesson, student)
+            else:
+                text, gradable = _last_line(answer), False
+        if text or not gradable:
+            what = text if gradable else f"not graded: {text}"
+            notes.append({"student": student, "lesson": lesson, "note": what})
+    pd.DataFrame(notes, columns=["student", "lesson", "note"]).to_csv(course / "notes.csv", index=False)
+    return report(course)
+
+
+def report(course: str | Path) -> Path:
+    """``course/grades.csv``: points of every student and lesson, and what was noticed.
+
+    The feedback pages lie in ``course/feedback/STUDENT/LESSON``.
+    """
+    course, rows = _course(course), []
+    with _nbgrader(course).gradebook as book:
+        for assignment in book.assignments:
+            for one in assignment.submissions:
+                to_read = one.max_written_score if one.needs_manual_grade else 0
+                rows.append((one.student.id, assignment.name, one.score, assignment.max_score, to_read))
+    columns = ["student", "lesson", "points", "of", "to_read"]
+    table, noted = pd.DataFrame(rows, columns=columns), course / "notes.csv"
+    if noted.exists():
+        notes = pd.read_csv(noted, dtype=str, keep_default_na=False)
+        notes = notes.groupby(["student", "lesson"], as_index=False).note.agg("; ".join)
+        table = table.merge(notes, "outer", ["student", "lesson"])
+    table.sort_values(["lesson", "student"]).to_csv(course / "grades.csv", index=False)
+    return course / "grades.csv"
+
+
+def _course(course: str | Path) -> Path:
+    course = Path(course).resolve()
+    if not (course / "nbgrader_config.py").exists():
+        raise InputError(f"{course} is no course; expected a folder made by `classroom release`")
+    return course
+
+
+def _nbgrader(course: Path) -> Any:
+    from nbgrader.apps import NbGraderAPI
+    from traitlets.config import PyFileConfigLoader
+
+    tools = str(Path(sys.executable).parent)  # nbgrader calls alembic by its bare name
+    if tools not in os.environ["PATH"].split(os.pathsep):
+        os.environ["PATH"] = os.pathsep.join([tools, os.environ["PATH"]])
+    config = PyFileConfigLoader(str(course / "nbgrader_config.py")).load_config()
+    config.CourseDirectory.root = str(course)
+    config.NbGraderAPI.log_level = logging.ERROR
+    logging.getLogger("traitlets").setLevel(logging.ERROR)
+    return NbGraderAPI(config=config)
+
+
+def _expect(answer: dict[str, Any], text: str) -> None:
+    if not answer["success"]:
+        raise InputError(f"{text}: {_last_line(answer)}")
+
+
+def _last_line(answer: dict[str, Any]) -> str:
+    lines = (answer.get("error") or answer.get("log") or "no reason given").strip().splitlines()
+    return lines[-1]

@@ -1,0 +1,58 @@
+"""What the exercises check answers with: a wrong answer gets a hint that names the mistake."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def check(found: Any, right: Any, hints: Mapping[str, Any] | None = None, tolerance: float = 1e-6) -> None:
+    """Nothing where ``found`` is right; else ``AssertionError``, with the hint whose wrong answer it is.
+
+    ``hints``: {hint: the answer that deserves it}. Numbers may differ by ``tolerance``, absolutely and
+    relatively; shapes may not differ. Tuples are compared part by part.
+    """
+    if same(found, right, tolerance):
+        return
+    for hint, wrong in (hints or {}).items():
+        if same(found, wrong, tolerance):
+            raise AssertionError(hint)
+    shapes = _shape(found), _shape(right)
+    if shapes[0] != shapes[1]:
+        raise AssertionError(f"The answer is {shapes[0]}; expected {shapes[1]}.")
+    raise AssertionError(f"The answer is\n{_shown(found)}\nexpected\n{_shown(right)}")
+
+
+def same(one: Any, other: Any, tolerance: float = 1e-6) -> bool:
+    """Are the two equal, numbers to within ``tolerance``?"""
+    if isinstance(other, tuple):
+        return (
+            isinstance(one, tuple)
+            and len(one) == len(other)
+            and all(same(a, b, tolerance) for a, b in zip(one, other, strict=True))
+        )
+    if one is None or other is None or isinstance(other, (str, bool)):
+        return type(one) is type(other) and one == other
+    try:
+        a, b = (np.asarray(_plain(x), dtype=float) for x in (one, other))
+    except (TypeError, ValueError):
+        return False
+    return a.shape == b.shape and np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True)
+
+
+def _plain(x: Any) -> Any:
+    return x.detach().numpy() if isinstance(x, torch.Tensor) else x
+
+
+def _shape(x: Any) -> str:
+    if isinstance(x, tuple):
+        return f"a tuple of {len(x)}"
+    if x is None or isinstance(x, (str, bool)):
+        return "nothing (is a return missing?)" if x is None else f"a {type(x).__name__}"
+    shape = np.shape(_plain(x))
+    return f"an array of shape {shape}" if shape else "a number"
+
+
+def _shown(x: Any) -> str:
+    return str(x if isinstance(x, (str, tuple)) or x is None else np.round(np.asarray(_plain(x)), 4))

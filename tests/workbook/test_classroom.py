@@ -1,0 +1,166 @@
+"""A class, from clone to grades: who handed in what, and what it earned."""
+
+import re
+import shutil
+from collections import Counter
+
+import nbformat
+import pandas as pd
+import pytest
+import test_exercises as exercises
+
+from dmsrd_lite.__main__ import main
+from dmsrd_lite.workbook import classroom
+
+LESSON = "04_policy_mixture"
+
+
+@pytest.fixture(scope="module")
+def course(tmp_path_factory):
+    course = tmp_path_factory.mktemp("class") / "course"
+    classroom.release(course, [LESSON, "07_benchmark"])
+    return course
+
+
+def hand_in(folder, student, notebook, name=f"{LESSON}.ipynb"):
+    (folder / student).mkdir(parents=True, exist_ok=True)
+    if isinstance(notebook, str):
+        (folder / student / name).write_text(notebook)
+    else:
+        nbformat.write(notebook, folder / student / name)
+
+
+def solved(lesson=LESSON, **answers):
+    """A student's copy with the solutions written in, or ``answers`` {task: code}."""
+    copy, right = exercises.student_copy(lesson), exercises.master(lesson)
+    known = {a["grade_id"]: source for a, source in exercises.code(right) if a.get("solution")}
+    for cell in copy.cells:
+        about = cell.metadata.get("nbgrader", {})
+        if cell.cell_type == "code" and about.get("solution"):
+            task = about["grade_id"]
+            kept = re.sub(r".*### (BEGIN|END) SOLUTION\n?", "", known[task])
+            cell.source = answers.get(task.replace("-", "_"), kept)
+    return copy
+
+
+def test_release_makes_a_course_that_nbgrader_knows(course):
+    assert (course / "nbgrader_config.py").exists()
+    names = sorted(path.parent.name for path in (course / "release").glob("*/*.ipynb"))
+    assert names == [LESSON, "07_benchmark"]
+
+
+@pytest.mark.parametrize(
+    ("files", "notes"),
+    [
+        ({"ada/04_policy_mixture.ipynb": ""}, {}),
+        ({"ada/04_policy_mixture/04_policy_mixture.ipynb": ""}, {}),
+        ({"ada/hw.ipynb": ""}, {"ada": "hw.ipynb is no exercise"}),
+        ({"04_policy_mixture.ipynb": ""}, {"?": "lies beside the students' folders"}),
+        (
+            {"ada/04_policy_mixture.ipynb": "", "late/ada/04_policy_mixture.ipynb": ""},
+            {"ada": "handed in 2 times, in ada and late/ada; expected once"},
+        ),
+        ({"ada/00_start_here.ipynb": ""}, {"ada": "is no exercise"}),
+    ],
+)
+def test_who_handed_in_what(files, notes, tmp_path):
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    found, said = classroom.find_submissions(tmp_path)
+    assert [(one.student, one.lesson) for one in found] == ([] if notes else [("ada", LESSON)])
+    assert {note["student"] for note in said} == set(notes)
+    assert all(notes[note["student"]] in note["note"] for note in said)
+
+
+def test_bad_input_is_one_sentence(course, tmp_path, capsys):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("")
+    for arguments, words in {
+        (
+            "release",
+            tmp_path / "new",
+            "--lesson",
+            "00_start_here",
+        ): "00_start_here has no exercise; expected one of 01",
+        ("release", tmp_path / "full"): "not empty and not a course",
+        ("grade", course, tmp_path / "nobody"): "no notebook in it; expected STUDENT/LESSON.ipynb",
+        ("report", tmp_path / "nowhere"): "no course; expected a folder made by",
+    }.items():
+        assert main(["classroom", *map(str, arguments)]) == 2
+        said = capsys.readouterr().err.strip()
+        assert words in said
+        assert "\n" not in said
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "gradable"),
+    [
+        (lambda notebook: notebook.cells.append(notebook.cells[3].copy()), "more than once", True),
+        (
+            lambda notebook: notebook.metadata.update(kernelspec={"name": "ir", "display_name": "R"}),
+            "kernel ir",
+            True,
+        ),
+        (lambda notebook: notebook.cells.clear(), "no task of the exercise", False),
+        (lambda notebook: None, "", True),
+    ],
+)
+def test_what_is_unusual_is_noticed(change, words, gradable, tmp_path):
+    copy = exercises.student_copy(LESSON)
+    change(copy)
+    hand_in(tmp_path, "ada", copy)
+    said, can = classroom.inspect(tmp_path / "ada" / f"{LESSON}.ipynb")
+    assert words in said
+    assert bool(said) == bool(words)
+    assert can == gradable
+
+
+@pytest.mark.verify
+def test_a_class_of_all_sorts(course, tmp_path):
+    """Full points for the reference, none untouched; each mishap costs its own student, or its own task."""
+    folder, lesson = tmp_path / "submissions", exercises.master(LESSON)
+    points = {
+        a["grade_id"].removesuffix("-check"): a["points"] for a, _ in exercises.code(lesson) if a.get("grade")
+    }
+    hand_in(folder, "ada", solved())
+    hand_in(folder, "ben", exercises.student_copy(LESSON))
+    hand_in(folder, "cleo", "this is no notebook")
+    hand_in(folder, "dora", solved(mix="def mix(weights, means, sigmas):\n    while True:\n        pass"))
+    edited = solved(explain="def explanation(*_):\n    return 'pure'")
+    for cell in edited.cells:
+        if cell.metadata.get("nbgrader", {}).get("grade_id") == "explain-check":
+            cell.source = "pass"
+    hand_in(folder, "emil", edited)
+    doubled = solved()
+    doubled.cells.append(doubled.cells[3].copy())
+    hand_in(folder, "fay", doubled)
+    noisy = solved()
+    noisy.cells[3].source = noisy.cells[3].source.replace(
+        "    return", "    import warnings\n    warnings.warn('harmless')\n    return", 1
+    )
+    hand_in(folder, "gil", noisy)
+    hand_in(folder, "hal", solved(), "my homework.ipynb")
+    shutil.copytree(folder / "ben", folder / "late" / "ben")
+    hand_in(folder, "ida", solved("07_benchmark"), "07_benchmark.ipynb")
+    table = pd.read_csv(classroom.grade(course, folder), keep_default_na=False).set_index("student")
+    full = sum(points.values())
+    earned = {name: float(value) for name, value in table.points.items() if value != ""}
+    assert earned == {
+        "ada": full, "dora": full - points["mix"], "emil": full - points["explain"], "fay": full, "gil": full,
+        "ida": 12,
+    }  # fmt: skip
+    notes = {
+        "ben": "handed in 2 times",
+        "cleo": "does not open",
+        "fay": "more than once",
+        "hal": "is no exercise",
+    }
+    assert {name: note for name, note in table.note.items() if note}.keys() == notes.keys()
+    assert all(words in table.note[name] for name, words in notes.items())
+    pages = Counter(path.parts[-3] for path in (course / "feedback").rglob("*.html"))
+    assert pages == Counter(["ada", "dora", "emil", "fay", "gil", "ida"])
+    shutil.rmtree(folder / "late")
+    table = pd.read_csv(classroom.grade(course, folder), keep_default_na=False).set_index("student")
+    assert float(table.points["ben"]) == 0
