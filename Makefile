@@ -2,7 +2,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 CODE := dmsrd_lite tests notebooks papermill_runs/peers
 
-.PHONY: workbook test verify lab lint lock results
+.PHONY: workbook test verify lab book lint lock results
 
 workbook: .venv/installed
 	$(BIN)/python -m dmsrd_lite run papermill_runs/plans/quick.toml --workers 2
@@ -15,6 +15,9 @@ verify: .venv/installed
 
 lab: .venv/installed
 	$(BIN)/python -m dmsrd_lite lab $(ROOT)
+
+book: .venv/installed
+	$(BIN)/python -m dmsrd_lite book
 
 lint: .venv/installed
 	$(BIN)/ruff check $(CODE)

@@ -81,6 +81,13 @@ def _gallery(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _book(arguments: argparse.Namespace) -> int:
+    from dmsrd_lite.workbook.book import make_book
+
+    print(make_book(Path(arguments.executed).resolve(), Path(arguments.output).resolve()))
+    return 0
+
+
 def _classroom(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
@@ -156,6 +163,9 @@ def _parser() -> argparse.ArgumentParser:
         "gallery", _gallery, "take the figures of the gallery out of a folder of executed notebooks"
     )
     gallery.add_argument("folder")
+    book = command("book", _book, "the executed lessons as pages to read without Python")
+    book.add_argument("--executed", default="papermill_runs/quick", help="folder of executed lessons")
+    book.add_argument("--output", default="build/book", help="folder for the pages")
     classroom = command("classroom", _classroom, "hand out the exercises, grade them, report")
     steps = classroom.add_subparsers(dest="step", required=True)
     release = steps.add_parser("release", help="make a course: copies for students, under COURSE/release")

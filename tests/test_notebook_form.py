@@ -118,6 +118,16 @@ def test_every_figure_is_explained_fits_the_page_and_keeps_the_colours(lesson):
 TEXTS = [NOTEBOOKS / "START.md", NOTEBOOKS / "README.md"]
 
 
+def test_what_was_to_be_predicted_is_answered_one_click_away(lesson):
+    cells = [c.source for c in lesson.notebook.cells]
+    asked = [i for i, text in enumerate(cells) if "**Predict first.**" in text]
+    answered = [i for i, text in enumerate(cells) if text.startswith("<details><summary>Answer</summary>")]
+    assert len(asked) == len(answered), "every question has one cell with its answer"
+    for i, j, following in zip(asked, answered, [*asked[1:], len(cells)], strict=True):
+        assert any(c.cell_type == "code" for c in lesson.notebook.cells[i:j]), "shown first, then told"
+        assert j <= following + 3, f"the answer to cell {i} comes after the next question"
+
+
 @pytest.mark.parametrize("path", [*lessons(), *COPIES, *TEXTS], ids=name)
 def test_links_lead_somewhere(path):
     text = path.read_text() if path.suffix == ".md" else Lesson(path).text

@@ -35,12 +35,17 @@ def open_lab(as_root: bool = False) -> int:
         )
         raise InputError(f"{text} ('make lab ROOT=--root') if you know that nobody else reaches this machine")
     print(copy_lessons())
-    for name, content in CONFIG.items():
-        path = check_folder(Path(sys.prefix) / "etc/jupyter/labconfig" / name)
-        path.write_text(json.dumps(content))
+    configure()
     page = f"--LabApp.default_url=/lab/tree/{MINE.name}/START.md"
     command = [sys.executable, "-m", "jupyterlab", f"--ServerApp.root_dir={ROOT}", page]
     return subprocess.call([*command, *(["--allow-root"] if as_root else [])])
+
+
+def configure() -> None:
+    """Set up this environment's JupyterLab for the lessons (``CONFIG``)."""
+    for name, content in CONFIG.items():
+        path = check_folder(Path(sys.prefix) / "etc/jupyter/labconfig" / name)
+        path.write_text(json.dumps(content))
 
 
 def copy_lessons(folder: Path = MINE) -> str:
