@@ -1,11 +1,12 @@
 """Figures and videos show what they were given, in colours of a fixed meaning."""
 
 import dataclasses
+from itertools import combinations
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_hex, to_rgb
 
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.workbook import figures, videos
@@ -109,3 +110,31 @@ def test_a_film_and_its_video(domain, small_set):
     html = videos.show_video(frames, 10).data
     for part in ('src="data:video/mp4;base64,', 'poster="data:image/png;base64,', "max-width:100%"):
         assert part in html
+
+
+SIGHT = {  # Machado, Oliveira and Fernandes (2009), full severity, on linear RGB
+    "usual": np.eye(3),
+    "protanopia":
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia":
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]],
+    "tritanopia":
+        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.3039]],
+}  # fmt: skip
+
+
+def cielab(color, sight):
+    rgb = np.array(to_rgb(color))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    xyz = to_xyz @ np.clip(np.array(sight) @ linear, 0, 1) / [0.9505, 1, 1.089]
+    x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("sight", SIGHT)
+@pytest.mark.parametrize("colors", [figures.STRATEGY_COLORS, figures.INKS], ids=["people", "methods"])
+def test_colours_differ_for_every_kind_of_sight(colors, sight):
+    """A difference of 2.3 can just be seen; markers and lines tell apart as well."""
+    seen = [cielab(color, SIGHT[sight]) for color in colors]
+    assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 10
