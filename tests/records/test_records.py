@@ -101,8 +101,7 @@ def test_fresh_policies_learn_again_as_recorded(name):
     record, _, domain, seed = prepared(name)
     lesson, part = "_".join(name.split("_")[:2]), "g" if name[:2] == "02" else "task"
     fresh = presets.choose(lesson, domain.name, "full").fresh
-    if settings_of(fresh) != record["settings"]["fresh"]:
-        pytest.xfail("the preset's fresh training has changed since: to be recorded anew")
+    assert settings_of(fresh) == record["settings"]["fresh"]
     for label, known in record["results"]["worth"].items():
         assert np.shape(known["curves"]) == (fresh.n_iterations, fresh.n_strategies)
         if label in record["results"]["table"]:
