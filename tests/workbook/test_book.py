@@ -51,7 +51,7 @@ def test_formulas_are_drawn_and_answers_are_folded(pages):
         prose = re.sub(r"<(pre|code)\b.*?</\1>", "", text, flags=re.DOTALL)
         assert not re.search(r"\$|\\[a-z]{2,}", prose), f"{name}: a formula is left as it was typed"
     folded = re.search(r"<details>.*?</details>", pages["02_airl.html"], re.DOTALL)
-    assert "State A" in folded[0]
+    assert "Place 0" in folded[0]
 
 
 def test_a_figure_is_told_by_the_text_that_reads_it_and_progress_is_left_out(pages):
