@@ -35,7 +35,7 @@ class DMSRDSettings:
     )
     kl_margin: float = 0.5  # nats above the reference (``kl_threshold.reference_divergence``)
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
-    task_from_first: bool = True  # R_Task starts as the first person's reward (the paper: as nothing)
+    task_from_first: bool = False  # R_Task starts as the first person's reward (the paper: as nothing)
     between_class: str = "always"  # Equation 4 after every branch, after "mixtures" only (the paper), "never"
     own_rollouts: int = 20  # it is asked on so many of each person's explanation from new starts; 0: on what
     # was shown (the paper)

@@ -126,6 +126,7 @@ METHODS_FROM_NOTHING = {
             usual.dmsrd,
             airl=from_nothing(name, AIRLSettings(), n_iterations=_DMSRD_FROM_NOTHING[name]),
             msrd=_round_from_nothing(name, usual.dmsrd.msrd),
+            task_from_first=True,
             policies_after_new=False,  # no cloning term would hold them near their demonstrations
             policies_after_mixture=False,
         ),
@@ -284,13 +285,16 @@ class DMSRDLesson:  # 06
 
     @property
     def ablations(self) -> dict[str, DMSRDSettings]:
-        """Ours from a clone, with one deviation from the paper taken back at a time."""
+        """Ours (from a clone, where no start is named), with one deviation from the paper taken back at a
+        time."""
         printed = self.loop.as_printed()
-        names = "add_task_reward", "task_from_first", "between_class", "own_rollouts", "search_again"
+        names = "add_task_reward", "between_class", "own_rollouts", "search_again"
         found = {f"{name} as printed": replace(self.loop, **{name: getattr(printed, name)}) for name in names}
         by_states = replace(self.loop, mixture=replace(self.loop.mixture, from_actions=False))
         found["from_actions as printed"] = by_states
-        moving = replace(self.forms["ours, nothing"], policies_after_new=True, policies_after_mixture=True)
+        nothing = self.forms["ours, nothing"]
+        found["task_from_first as printed, nothing"] = replace(nothing, task_from_first=False)
+        moving = replace(nothing, policies_after_new=True, policies_after_mixture=True)
         found["policies learn in rounds, nothing"] = moving
         return found | {"without BCD": replace(self.loop, between_class="never")}
 

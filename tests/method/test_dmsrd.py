@@ -49,8 +49,8 @@ def test_the_first_demonstration_makes_the_first_strategy(three, monkeypatch):
         "new strategy", None, [1.0], [True]]  # fmt: skip
     assert record["steps"] == {"search": 0, "airl": 50 + 3 * 50, "msrd": 0, "between_class": 0}
     assert (state.weights.tolist(), state.pure, state.n_strategies) == ([[1.0]], (0,), 1)
-    assert same(state.networks, reward_as_task(made[0]["learner"].networks(), TINY.msrd.alpha))
-    assert not state.rewards().evaluate(three.observations, "g").any()
+    assert same(state.networks, made[0]["learner"].networks())
+    assert not state.rewards().evaluate(three.observations, "task").any()
 
 
 @pytest.mark.parametrize(
@@ -221,10 +221,13 @@ def test_as_printed_takes_every_deviation_back():
     assert printed.airl == TINY.airl
 
 
-def test_the_task_reward_starts_as_the_first_persons_reward(three, states):
+def test_the_task_reward_starts_as_the_first_persons_reward(three, monkeypatch):
     """R_1 is what AIRL learned, all of it in R_Task; as printed R_Task is nothing yet."""
     printed = after(State(PENDULUM, 0), three.select([0]), TINY.as_printed())
-    seen, first = three.observations, states[1].rewards()
+    made = watch(monkeypatch, dmsrd, "AIRL")
+    state = after(State(PENDULUM, 0), three.select([0]), replace(TINY, task_from_first=True))
+    assert same(state.networks, reward_as_task(made[0]["learner"].networks(), TINY.msrd.alpha))
+    seen, first = three.observations, state.rewards()
     assert np.abs(first.evaluate(seen, "task")).min() > 0
     assert np.abs(first.evaluate(seen, "g")).max() == 0
     assert np.abs(printed.rewards().evaluate(seen, "task")).max() == 0
