@@ -175,9 +175,9 @@ def test_the_book_opens_without_a_network(browser, tmp_path):
     page.locator("nav a", has_text="02 Adversarial").click()
     assert page.locator("math").count() > 20
     answer = page.locator("details").first
-    assert "State A" not in answer.inner_text()
+    assert answer.inner_text().strip() == "Answer"
     answer.locator("summary").click()
-    assert "State A" in answer.inner_text()
+    assert len(answer.inner_text().split()) > 20
     assert page.evaluate("document.documentElement.scrollWidth") <= 1280
     page.screenshot(path=PICTURES / "book.png")
     assert all(url.startswith(("file:", "data:")) for url in asked)
