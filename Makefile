@@ -8,10 +8,10 @@ workbook: .venv/installed
 	$(BIN)/python -m dmsrd_lite run papermill_runs/plans/quick.toml --workers 2
 
 test: .venv/installed lint
-	$(BIN)/python -m pytest -m "not verify" -n 2 --maxschedchunk 1
+	$(BIN)/python -m pytest -m "not verify" -n 2 --maxschedchunk 1 --durations 12
 
 verify: .venv/installed
-	$(BIN)/python -m pytest -m verify -n 2 --maxschedchunk 1
+	$(BIN)/python -m pytest -m verify -n 2 --maxschedchunk 1 --durations 12
 
 lab: .venv/installed
 	$(BIN)/python -m dmsrd_lite lab $(ROOT)

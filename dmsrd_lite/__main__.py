@@ -1,8 +1,9 @@
-"""Command line: ``python -m dmsrd_lite {generate,validate,run,results,bench,gallery,classroom,lab}``."""
+"""Command line: ``python -m dmsrd_lite COMMAND``; without one it lists them."""
 
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -37,6 +38,18 @@ def _generate(arguments: argparse.Namespace) -> int:
                 test_sets.generate_test_set, n_episodes=episodes, progress=partial(tqdm, desc=kind)
             )
             print(make(domain, settings, seed + offset, path))
+    return 0
+
+
+def _convert(arguments: argparse.Namespace) -> int:
+    from dmsrd_lite.beyond.conversion import convert
+    from dmsrd_lite.demonstrations import save_demonstrations
+
+    domain = get_domain(arguments.domain) if arguments.domain else None
+    found, notes = convert(arguments.source, domain, arguments.each, arguments.steps)
+    path = save_demonstrations(arguments.file, found)
+    n, k, t = found.actions.shape[:3]
+    print(*notes, f"{path}: {n} demonstrations of {k} trajectories, {t} steps, {found.domain.name}", sep="\n")
     return 0
 
 
@@ -111,47 +124,64 @@ def _lab(arguments: argparse.Namespace) -> int:
     return open_lab(arguments.root)
 
 
+_Adds = Callable[[str, Callable[[argparse.Namespace], int], str], argparse.ArgumentParser]
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m dmsrd_lite", description="The helper package of the DMSRD workbook."
     )
     commands = parser.add_subparsers(dest="command", required=True)
 
-    def command(name: str, action: object, text: str) -> argparse.ArgumentParser:
+    def command(name: str, action: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
         added = commands.add_parser(name, help=text)
         added.set_defaults(action=action)
         return added
 
-    generate = command(
-        "generate", _generate, "train demonstrators; write them, what they show, a stream and test sets"
-    )
+    _add_data(command)
+    _add_runs(command)
+    _add_pages(command)
+    return parser
+
+
+def _whole(name: str, least: int) -> Callable[[str], int]:
+    return partial(check_whole, name=name, least=least)
+
+
+def _add_data(command: _Adds) -> None:
+    text = "train demonstrators; write them, what they show, a stream and test sets"
+    generate = command("generate", _generate, text)
     generate.add_argument("domain")
     generate.add_argument("--seed", default="0")
     generate.add_argument("--output", help="folder for the files (default: the repository's data)")
     generate.add_argument(
         "--part", action="append", choices=_PARTS, help="only this one (again for more; default: all)"
     )
+    convert = command("convert", _convert, "make a demonstration file of arrays, a Minari dataset or others")
+    convert.add_argument("source", help="an .npz file, or the folder of a dataset")
+    convert.add_argument("file", help="where to write the demonstration file (.npz)")
+    convert.add_argument("--domain", default="", help="(default: the one whose states are as wide)")
+    text = "so many episodes in a row are one person's (default: 1)"
+    convert.add_argument("--each", type=_whole("each", 1), default=1, help=text)
+    text = "only the first so many steps of every episode (default: all)"
+    convert.add_argument("--steps", type=_whole("steps", 0), default=0, help=text)
     validate = command("validate", _validate, "say what is wrong with a demonstration or test file")
     validate.add_argument("files", nargs="+")
+
+
+def _add_runs(command: _Adds) -> None:
     run = command("run", _run, "run what is left of a plan: one notebook, or several, with many parameters")
     run.add_argument("plan", help="a .toml file, as in papermill_runs/plans")
-    run.add_argument(
-        "--workers",
-        type=partial(check_whole, name="workers", least=1),
-        default=0,
-        help="processes on this machine (default: one for every two cores)",
-    )
-    run.add_argument(
-        "--scheduler", default="", help="address of a Dask scheduler, as tcp://host:8786, to run there"
-    )
-    run.add_argument(
-        "--only", action="append", default=[], metavar="NAME=VALUE", help="only runs with this parameter"
-    )
+    text = "processes on this machine (default: one for every two cores)"
+    run.add_argument("--workers", type=_whole("workers", 1), default=0, help=text)
+    text = "address of a Dask scheduler, as tcp://host:8786, to run there"
+    run.add_argument("--scheduler", default="", help=text)
+    text = "only runs with this parameter"
+    run.add_argument("--only", action="append", default=[], metavar="NAME=VALUE", help=text)
     run.add_argument("--force", action="store_true", help="also the runs that are finished")
     run.add_argument("--dry-run", action="store_true", help="say what would run, and why")
-    run.add_argument(
-        "--output", help="folder of records and executed notebooks (default: papermill_runs/NAME)"
-    )
+    text = "folder of records and executed notebooks (default: papermill_runs/NAME)"
+    run.add_argument("--output", help=text)
     results = command("results", _results, "make RESULTS.md and the tables from the records")
     results.add_argument("--output", help="folder to write into (default: the repository)")
     bench = command("bench", _bench, "training speed over raw simulator speed, in one run")
@@ -159,10 +189,11 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--seed", default="0")
     bench.add_argument("--iterations", default="6")
     bench.add_argument("--from-nothing", default="0", help="iterations from nothing (0: as in the lessons)")
-    gallery = command(
-        "gallery", _gallery, "take the figures of the gallery out of a folder of executed notebooks"
-    )
-    gallery.add_argument("folder")
+
+
+def _add_pages(command: _Adds) -> None:
+    text = "take the figures of the gallery out of a folder of executed notebooks"
+    command("gallery", _gallery, text).add_argument("folder")
     book = command("book", _book, "the executed lessons as pages to read without Python")
     book.add_argument("--executed", default="papermill_runs/quick", help="folder of executed lessons")
     book.add_argument("--output", default="build/book", help="folder for the pages")
@@ -174,13 +205,11 @@ def _parser() -> argparse.ArgumentParser:
     grade = steps.add_parser("grade", help="grade a folder of submissions: points, hints, pages for students")
     grade.add_argument("course")
     grade.add_argument("submissions", help="a folder with STUDENT/LESSON.ipynb for each student")
-    steps.add_parser(
-        "report", help="the table of points again, after a teacher has read the open answers"
-    ).add_argument("course")
+    text = "the table of points again, after a teacher has read the open answers"
+    steps.add_parser("report", help=text).add_argument("course")
     steps.add_parser("copies", help="make the copies beside the lessons anew from the solutions")
     lab = command("lab", _lab, "JupyterLab on a copy of the lessons that is yours")
     lab.add_argument("--root", action="store_true", help="as root, which JupyterLab refuses otherwise")
-    return parser  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -119,7 +119,7 @@ class RewardTestSet:
     failed: np.ndarray | None = None
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     """All arrays of a file, and a sentence for each that cannot be read."""
     if not path.is_file():
         return {}, ["there is no such file; expected a demonstration set (.npz)"]
@@ -240,7 +240,7 @@ def _check_test_set(arrays: dict, metadata: dict, domain: Domain) -> list[str]:
 def _inspect(path: Path, domain: Domain | None = None) -> tuple[dict[str, np.ndarray], dict, list[str]]:
     """Arrays, metadata and faults of a file, read once; ``domain`` may be one that is not in ``DOMAINS``."""
     known = {**DOMAINS, **({domain.name: domain} if domain else {})}
-    (arrays, faults), metadata = _read(path), dict[str, Any]()
+    (arrays, faults), metadata = read_arrays(path), dict[str, Any]()
     if arrays or not faults:
         metadata, more = _read_metadata(arrays, known)
         faults += more

@@ -395,6 +395,49 @@ def _lifelong(domain: str, quick: bool) -> LifelongLesson:
     return LifelongLesson(6, loop, cloning_steps=1500, n_many=20)
 
 
+@dataclass(frozen=True)
+class BeyondLesson:  # 09
+    users: tuple[int, ...]  # whose files are converted; DMSRD knows them when you come
+    loop: DMSRDSettings
+    skill: int  # who does what you steer, ...
+    stops: tuple[float, ...]  # ... and where the script steers to
+    five: tuple[int, ...]  # people with a slider
+    pair: tuple[int, int]  # somebody wants what these two want ...
+    training: TrainingSettings  # ... trained like this, one policy for each of the shares
+    fresh: TrainingSettings  # policies on a frozen reward
+    batch: AIRLSettings  # whose reward is looked at on the way, ...
+    moments: tuple[int, ...]  # ... at these iterations
+    cheetahs: DiaynSettings
+    shares: tuple[tuple[float, float], ...] = ((1.0, 0.0), (0.5, 0.5), (0.0, 1.0))
+    alpha: float = MSRDSettings.alpha
+    cheetah_airl: AIRLSettings = AIRLSettings(
+        n_iterations=5, episodes=4, cloning_steps=1000, coverage_episodes=1
+    )
+    blend: tuple[float, float, float] = (0.5, 0.5, 0.0)
+
+
+def _beyond(domain: str, quick: bool) -> BeyondLesson:
+    fresh, batch = _fresh(domain), METHODS_FROM_NOTHING[domain].batch
+    runners = TrainingSettings(
+        n_strategies=3, n_iterations=30 if quick else 150, episodes=10, first_sigma=0.5, last_rate=0.1,
+        ppo=PPOSettings(epochs=4, minibatch=500),
+    )  # fmt: skip
+    few = _dmsrd(domain, True)
+    return BeyondLesson(
+        users=few.users[:2],
+        loop=few.loop,
+        skill={PENDULUM: 0, LANDER: 4}[domain],
+        stops={PENDULUM: (0.4,), LANDER: (0.3,)}[domain],
+        five=(0, 1, 4, 5, 8) if domain == PENDULUM else (0, 1, 2, 3, 4),
+        pair=(4, 8) if domain == PENDULUM else (0, 2),
+        training=replace(fresh, n_strategies=3),
+        fresh=fresh,
+        batch=batch,
+        moments=tuple(batch.n_iterations * k // 6 for k in range(1, 7)),
+        cheetahs=DiaynSettings(diversity_weight=0.1, training=runners),
+    )
+
+
 def _dmsrd(domain: str, quick: bool) -> DMSRDLesson:
     loop = METHODS[domain].dmsrd
     if not quick:
@@ -447,6 +490,7 @@ LESSONS: dict[str, Any] = {  # (domain, quick) -> settings
     "06_dmsrd": _dmsrd,
     "07_benchmark": _benchmark,
     "08_lifelong_100": _lifelong,
+    "09_beyond": _beyond,
 }  # fmt: skip
 
 

@@ -1,0 +1,189 @@
+"""Demonstrations of your own as a demonstration set, from three kinds of files. Nothing is unpickled.
+
+Plain arrays (``.npz``), the folder of a Minari dataset, and the folder of trajectories that ``imitation`` (or
+``datasets``) saved.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dmsrd_lite.demonstrations import DemonstrationSet, read_arrays
+from dmsrd_lite.domains import DOMAINS, Domain, InputError
+
+
+@dataclass(frozen=True)
+class Episode:
+    observations: np.ndarray  # (T + 1, obs_dim); (T, obs_dim) when the last successor is unknown
+    actions: np.ndarray | None  # (T, action_dim), executed
+    rewards: np.ndarray | None = None  # (T,)
+    over: bool = False  # it ended because the task was over, not because the time was
+
+
+def convert(
+    source: str | Path, domain: Domain | None = None, each: int = 1, steps: int = 0
+) -> tuple[DemonstrationSet, list[str]]:
+    """A demonstration set from other people's files, and what a reader should know about it, a sentence each.
+
+    ``domain``: by default the one with as many observations and actions. ``each``: so many episodes in a row
+    are one person's (a file with four axes says so itself). ``steps``: only the first so many steps of every
+    episode; 0: all. ``InputError`` for what cannot be used: episodes of different lengths, that ended early,
+    without actions, of another domain.
+    """
+    path = Path(source).resolve()
+    episodes, together = _episodes(path)
+    each = together or each
+    if len(episodes) % each:
+        raise InputError(
+            f"{path}: holds {len(episodes)} episodes; expected a multiple of {each}, each person's"
+        )
+    domain = domain or _domain_of(path, episodes[0])
+    for i, episode in enumerate(episodes):
+        if fault := _fault(episode, domain, steps, len(episodes[0].observations)):
+            raise InputError(f"{path}: episode {i}: {fault}")
+    kept: dict[str, Any] = {
+        name: _stack([getattr(e, name) for e in episodes], each, steps)
+        for name in ("actions", "rewards")
+        if all(getattr(e, name) is not None for e in episodes)
+    }
+    states = [e.observations for e in episodes]
+    kept["observations"] = _stack(states, each, steps + 1 if steps else 0)
+    notes = []
+    if any(states.dtype == np.float32 for states in (e.observations for e in episodes)):
+        notes.append("observations are float32: states that differ by less than a millionth look the same")
+    if "rewards" not in kept:
+        notes.append("there are no rewards: returns are unknown, and nothing that learns needs them")
+    if each == 1:
+        notes.append("one trajectory per person: how far it is from itself is unknown (lesson 06, eps)")
+    return DemonstrationSet(domain, **kept, metadata={"source": path.name}), notes
+
+
+def _stack(parts: Sequence[np.ndarray], each: int, n: int) -> np.ndarray:
+    """Equally long parts (T, ...) -> (persons, each, n or T, ...) in double precision."""
+    whole = np.stack([part[: n or None] for part in parts]).astype(np.float64)
+    return whole.reshape(-1, each, *whole.shape[1:])
+
+
+def _domain_of(path: Path, episode: Episode) -> Domain:
+    acted = 0 if episode.actions is None else episode.actions.shape[-1]
+    found = [d for d in DOMAINS.values() if d.obs_dim == episode.observations.shape[-1]]
+    fits = [d for d in found if episode.actions is None or d.action_dim == acted]
+    if len(fits) != 1:
+        shapes = "; ".join(f"{d.obs_dim} and {d.action_dim} ({d.name})" for d in DOMAINS.values())
+        seen = f"{episode.observations.shape[-1]} observations and {acted} actions a step"
+        raise InputError(f"{path}: has {seen}; expected {shapes}")
+    return fits[0]
+
+
+def _fault(episode: Episode, domain: Domain, steps: int, n_states: int) -> str:
+    """What is wrong with an episode; nothing if it can be used."""
+    states, actions = episode.observations, episode.actions
+    if actions is None:
+        return "has no actions; expected the executed action of every step"
+    t = len(actions)
+    if states.ndim != 2 or len(states) not in (t, t + 1) or states.shape[1] != domain.obs_dim:
+        return f"has observations of shape {states.shape}; expected ({t} or {t + 1}, {domain.obs_dim})"
+    if actions.shape != (t, domain.action_dim):
+        return f"has actions of shape {actions.shape}; expected ({t}, {domain.action_dim})"
+    if steps:
+        return f"has {t} steps; expected at least {steps}" if t < steps or len(states) <= steps else ""
+    if episode.over:
+        go_on = "expected a task that goes on for a fixed time, or --steps to cut all episodes"
+        return f"ended early, after {t} steps; {go_on}"
+    if len(states) != n_states:
+        return (
+            f"has {len(states)} states, the first has {n_states}; expected equally long episodes, or --steps"
+        )
+    return ""
+
+
+def _episodes(path: Path) -> tuple[list[Episode], int]:
+    """What the file or folder holds, and how many in a row are one person's (0: it does not say)."""
+    if path.suffix == ".npz":
+        return _from_arrays(path)
+    if (path / "state.json").is_file():
+        found = _from_saved_trajectories(path)
+    else:
+        folders = sorted({file.parent for file in path.rglob("metadata.json") if file.parent.name == "data"})
+        if len(folders) > 1:
+            names = ", ".join(str(folder.parent.relative_to(path)) for folder in folders)
+            raise InputError(f"{path}: holds {len(folders)} datasets ({names}); expected the folder of one")
+        if not folders:
+            kinds = "an .npz file, a Minari dataset, or trajectories saved by imitation"
+            raise InputError(f"{path}: holds no demonstrations that we can read; expected {kinds}")
+        found = _from_minari(folders[0])
+    if not found:
+        raise InputError(f"{path}: holds no episode; expected at least one")
+    return found, 0
+
+
+def _from_arrays(path: Path) -> tuple[list[Episode], int]:
+    """observations and actions (episodes, steps, dimension) or (persons, episodes, steps, dimension)."""
+    arrays, faults = read_arrays(path)
+    if faults:
+        raise InputError(f"{path}: {faults[0]}")
+    states, expected = arrays.get("observations"), "expected (episodes, steps, dimension)"
+    if states is None or states.ndim not in (3, 4) or not states.size:
+        shape = "is missing" if states is None else f"has shape {states.shape}"
+        raise InputError(f"{path}: observations: {shape}; {expected}, or one axis more in front for persons")
+    lead = states.shape[:-2]
+    for name, n_axes in (("actions", len(lead) + 2), ("rewards", len(lead) + 1)):
+        if name in arrays and (arrays[name].shape[: len(lead)] != lead or arrays[name].ndim != n_axes):
+            raise InputError(f"{path}: {name}: has shape {arrays[name].shape}; expected {(*lead, '...')}")
+    flat = {k: arrays[k].reshape(-1, *arrays[k].shape[len(lead) :]) for k in _NAMES if k in arrays}
+    found = [Episode(**{"actions": None, **{k: v[i] for k, v in flat.items()}}) for i in range(np.prod(lead))]
+    return found, lead[1] if len(lead) == 2 else 0
+
+
+_NAMES = ("observations", "actions", "rewards")
+
+
+def _from_minari(folder: Path) -> list[Episode]:
+    try:
+        from minari import MinariDataset
+
+        episodes = list(MinariDataset(folder).iterate_episodes())
+    except ImportError:
+        raise InputError(f"{folder}: needs Minari; expected pip install 'minari[hdf5]' first") from None
+    except (OSError, ValueError, KeyError) as error:
+        what = f"cannot be read ({type(error).__name__})"
+        raise InputError(f"{folder}: {what}; expected a whole Minari dataset") from None
+    if any(isinstance(e.observations, dict | tuple) for e in episodes):
+        raise InputError(f"{folder}: observations have parts; expected one vector for every step")
+    return [
+        Episode(e.observations, e.actions, e.rewards, bool(np.any(e.terminations)))  # type: ignore[arg-type]
+        for e in episodes
+    ]
+
+
+def _from_saved_trajectories(folder: Path) -> list[Episode]:
+    """A folder written by ``imitation.data.serialize.save``: Arrow files with obs, acts, rews, terminal."""
+    try:
+        from pyarrow import ArrowInvalid, ipc
+    except ImportError:
+        raise InputError(f"{folder}: needs pyarrow; expected pip install pyarrow first") from None
+    found = []
+    try:
+        for file in json.loads((folder / "state.json").read_text())["_data_files"]:
+            with ipc.open_stream(folder / file["filename"]) as stream:
+                table = stream.read_all()
+            for row in range(len(table)):
+                cells = {name: table[name][row] for name in table.column_names}
+                acts, rews = (_array(cells[k]) if k in cells else None for k in ("acts", "rews"))
+                over = "terminal" in cells and cells["terminal"].as_py()
+                found.append(Episode(_array(cells["obs"]), acts, rews, bool(over)))
+        return found
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ArrowInvalid) as error:
+        what = f"cannot be read ({type(error).__name__})"
+        raise InputError(f"{folder}: {what}; expected trajectories with obs and acts") from None
+
+
+def _array(cell: Any) -> np.ndarray:
+    """A cell of an Arrow table, a list of numbers or of equally long lists of numbers, as an array."""
+    rows, nested = cell.values, hasattr(cell.values, "flatten") and cell.values.type.num_fields
+    flat = (rows.flatten() if nested else rows).to_numpy(zero_copy_only=False)
+    return flat.reshape(len(rows), -1) if nested else flat
