@@ -274,7 +274,6 @@ class DMSRDLesson:  # 06
     n_known: int = 5  # the rule for eps: so many are known ...
     n_decisions: int = 20  # ... and so many people of a new kind, and as many mixtures, arrive
     margins: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # eps above its reference (nats)
-    ablated_seed: int = 0  # only with this one deviations are taken back, too
 
     @property
     def forms(self) -> dict[str, DMSRDSettings]:

@@ -76,7 +76,7 @@ def _numbers(record: dict, domain: Domain) -> Iterator[tuple[str, str, Any]]:
     floor, own = np.array(r["floor"]), np.array(r["own_log_likelihood"])
     yield "demonstrator", "divergence", floor
     yield "demonstrator", "log_likelihood_per_step", own
-    for method, scores in r["table"].items():
+    for method, scores in r.get("table", {}).items():
         yield from _scores(method, scores, domain, floor, own)
     for name, scores in r.get("ablations", {}).items():
         yield from _scores(f"ours, clone: {name}", scores, domain, floor, own)

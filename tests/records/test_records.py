@@ -44,6 +44,7 @@ def of(pattern):
 
 
 FROM_NOTHING = of("0[23]")
+FORMS = [name for name in of("06") if "ablations" not in name]
 
 
 def restored(name, method):
@@ -95,7 +96,7 @@ def test_recorded_rewards_correlate_again_as_recorded(name):
 
 
 @pytest.mark.verify
-@pytest.mark.parametrize("name", FROM_NOTHING + of("06"))
+@pytest.mark.parametrize("name", FROM_NOTHING + FORMS)
 def test_fresh_policies_learn_again_as_recorded(name):
     """The whole training takes minutes; its first iterations, which depend on the reward, come back."""
     record, _, domain, seed = prepared(name)
@@ -156,7 +157,7 @@ def test_recorded_strategy_rewards_recognise_again_as_recorded(name):
 
 
 @pytest.mark.verify
-@pytest.mark.parametrize("name", of("06"))
+@pytest.mark.parametrize("name", FORMS)
 def test_recorded_runs_of_algorithm_1_score_again_as_recorded(name):
     record, tensors, domain, seed = prepared(name)
     settings, arrival = record["settings"], record["results"]["arrival"]
