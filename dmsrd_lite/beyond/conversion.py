@@ -21,6 +21,7 @@ class Episode:
     observations: np.ndarray  # (T + 1, obs_dim); (T, obs_dim) when the last successor is unknown
     actions: np.ndarray | None  # (T, action_dim), executed
     rewards: np.ndarray | None = None  # (T,)
+    reset_seeds: int | None = None  # a rollout can start as it did
     over: bool = False  # it ended because the task was over, not because the time was
 
 
@@ -50,6 +51,8 @@ def convert(
         for name in ("actions", "rewards")
         if all(getattr(e, name) is not None for e in episodes)
     }
+    if all(e.reset_seeds is not None for e in episodes):
+        kept["reset_seeds"] = np.array([e.reset_seeds for e in episodes]).reshape(-1, each)
     states = [e.observations for e in episodes]
     kept["observations"] = _stack(states, each, steps + 1 if steps else 0)
     notes = []
@@ -131,7 +134,7 @@ def _from_arrays(path: Path) -> tuple[list[Episode], int]:
         shape = "is missing" if states is None else f"has shape {states.shape}"
         raise InputError(f"{path}: observations: {shape}; {expected}, or one axis more in front for persons")
     lead = states.shape[:-2]
-    for name, n_axes in (("actions", len(lead) + 2), ("rewards", len(lead) + 1)):
+    for name, n_axes in (("actions", len(lead) + 2), ("rewards", len(lead) + 1), ("reset_seeds", len(lead))):
         if name in arrays and (arrays[name].shape[: len(lead)] != lead or arrays[name].ndim != n_axes):
             raise InputError(f"{path}: {name}: has shape {arrays[name].shape}; expected {(*lead, '...')}")
     flat = {k: arrays[k].reshape(-1, *arrays[k].shape[len(lead) :]) for k in _NAMES if k in arrays}
@@ -139,7 +142,7 @@ def _from_arrays(path: Path) -> tuple[list[Episode], int]:
     return found, lead[1] if len(lead) == 2 else 0
 
 
-_NAMES = ("observations", "actions", "rewards")
+_NAMES = ("observations", "actions", "rewards", "reset_seeds")
 
 
 def _from_minari(folder: Path) -> list[Episode]:
@@ -155,7 +158,7 @@ def _from_minari(folder: Path) -> list[Episode]:
     if any(isinstance(e.observations, dict | tuple) for e in episodes):
         raise InputError(f"{folder}: observations have parts; expected one vector for every step")
     return [
-        Episode(e.observations, e.actions, e.rewards, bool(np.any(e.terminations)))  # type: ignore[arg-type]
+        Episode(e.observations, e.actions, e.rewards, over=bool(np.any(e.terminations)))  # type: ignore[arg-type]
         for e in episodes
     ]
 
@@ -175,7 +178,7 @@ def _from_saved_trajectories(folder: Path) -> list[Episode]:
                 cells = {name: table[name][row] for name in table.column_names}
                 acts, rews = (_array(cells[k]) if k in cells else None for k in ("acts", "rews"))
                 over = "terminal" in cells and cells["terminal"].as_py()
-                found.append(Episode(_array(cells["obs"]), acts, rews, bool(over)))
+                found.append(Episode(_array(cells["obs"]), acts, rews, over=bool(over)))
         return found
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArrowInvalid) as error:
         what = f"cannot be read ({type(error).__name__})"

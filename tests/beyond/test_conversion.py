@@ -66,8 +66,9 @@ def test_only_the_first_steps(arrays, tmp_path):
 
 def test_a_file_with_four_axes_says_who_is_who(arrays, tmp_path):
     people = {k: v.reshape(2, 2, *v.shape[1:]) for k, v in arrays.items()}
-    found, _ = convert(plain(tmp_path, people))
+    found, _ = convert(plain(tmp_path, people, reset_seeds=np.array([[5, 6], [7, 8]])))
     assert found.actions.shape == (2, 2, T, 1)
+    assert found.reset_seeds.tolist() == [[5, 6], [7, 8]]
 
 
 def test_notes(arrays, tmp_path):
