@@ -68,8 +68,14 @@ SHIPPED = str(DATA_FOLDER / "inverted_pendulum_demonstrations.npz")
             "order '2,0,x': expected numbers from 0",
         ),
         ("06_dmsrd", {"order": "0,99", "demonstrations_path": SHIPPED}, "order '0,99': expected numbers"),
-        ("08_lifelong_100", {"users": 5}, "users 5: expected a whole number from 10 to 100"),
-        ("08_lifelong_100", {"remembered": -1}, "remembered -1: expected a whole number"),
+        ("08_lifelong_100", {"users": 5}, "users 5: expected a whole number from 6 to 100"),
+        ("08_lifelong_100", {"form": "theirs"}, "form 'theirs': expected one of ours, as printed"),
+        (
+            "08_lifelong_100",
+            {"part": "all"},
+            "part 'all': expected one of trial, ablations, orders, thousand",
+        ),
+        ("08_lifelong_100", {"users": 7, "record": True}, "record=True with users: expected users=0"),
     ],
 )
 def test_a_bad_parameter_ends_the_lesson_at_its_start(name, parameters, sentence, tmp_path, monkeypatch):

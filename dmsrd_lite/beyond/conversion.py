@@ -21,7 +21,7 @@ class Episode:
     observations: np.ndarray  # (T + 1, obs_dim); (T, obs_dim) when the last successor is unknown
     actions: np.ndarray | None  # (T, action_dim), executed
     rewards: np.ndarray | None = None  # (T,)
-    reset_seeds: int | None = None  # a rollout can start as it did
+    reset_seed: int | None = None  # a rollout can start as it did
     over: bool = False  # it ended because the task was over, not because the time was
 
 
@@ -51,12 +51,12 @@ def convert(
         for name in ("actions", "rewards")
         if all(getattr(e, name) is not None for e in episodes)
     }
-    if all(e.reset_seeds is not None for e in episodes):
-        kept["reset_seeds"] = np.array([e.reset_seeds for e in episodes]).reshape(-1, each)
+    if all(e.reset_seed is not None for e in episodes):
+        kept["reset_seeds"] = np.array([e.reset_seed for e in episodes]).reshape(-1, each)
     states = [e.observations for e in episodes]
     kept["observations"] = _stack(states, each, steps + 1 if steps else 0)
     notes = []
-    if any(states.dtype == np.float32 for states in (e.observations for e in episodes)):
+    if any(some.dtype == np.float32 for some in states):
         notes.append("observations are float32: states that differ by less than a millionth look the same")
     if "rewards" not in kept:
         notes.append("there are no rewards: returns are unknown, and nothing that learns needs them")
@@ -137,12 +137,9 @@ def _from_arrays(path: Path) -> tuple[list[Episode], int]:
     for name, n_axes in (("actions", len(lead) + 2), ("rewards", len(lead) + 1), ("reset_seeds", len(lead))):
         if name in arrays and (arrays[name].shape[: len(lead)] != lead or arrays[name].ndim != n_axes):
             raise InputError(f"{path}: {name}: has shape {arrays[name].shape}; expected {(*lead, '...')}")
-    flat = {k: arrays[k].reshape(-1, *arrays[k].shape[len(lead) :]) for k in _NAMES if k in arrays}
-    found = [Episode(**{"actions": None, **{k: v[i] for k, v in flat.items()}}) for i in range(np.prod(lead))]
-    return found, lead[1] if len(lead) == 2 else 0
-
-
-_NAMES = ("observations", "actions", "rewards", "reset_seeds")
+    n, names = int(np.prod(lead)), ("observations", "actions", "rewards", "reset_seeds")
+    flat = [arrays[k].reshape(n, *arrays[k].shape[len(lead) :]) if k in arrays else [None] * n for k in names]
+    return [Episode(*parts) for parts in zip(*flat, strict=True)], lead[1] if len(lead) == 2 else 0
 
 
 def _from_minari(folder: Path) -> list[Episode]:
@@ -157,10 +154,7 @@ def _from_minari(folder: Path) -> list[Episode]:
         raise InputError(f"{folder}: {what}; expected a whole Minari dataset") from None
     if any(isinstance(e.observations, dict | tuple) for e in episodes):
         raise InputError(f"{folder}: observations have parts; expected one vector for every step")
-    return [
-        Episode(e.observations, e.actions, e.rewards, over=bool(np.any(e.terminations)))  # type: ignore[arg-type]
-        for e in episodes
-    ]
+    return [_episode(e.observations, e.actions, e.rewards, np.any(e.terminations)) for e in episodes]
 
 
 def _from_saved_trajectories(folder: Path) -> list[Episode]:
@@ -178,11 +172,15 @@ def _from_saved_trajectories(folder: Path) -> list[Episode]:
                 cells = {name: table[name][row] for name in table.column_names}
                 acts, rews = (_array(cells[k]) if k in cells else None for k in ("acts", "rews"))
                 over = "terminal" in cells and cells["terminal"].as_py()
-                found.append(Episode(_array(cells["obs"]), acts, rews, over=bool(over)))
+                found.append(_episode(_array(cells["obs"]), acts, rews, over))
         return found
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArrowInvalid) as error:
         what = f"cannot be read ({type(error).__name__})"
         raise InputError(f"{folder}: {what}; expected trajectories with obs and acts") from None
+
+
+def _episode(states: Any, actions: Any, rewards: Any, over: Any) -> Episode:
+    return Episode(states, actions, rewards, over=bool(over))
 
 
 def _array(cell: Any) -> np.ndarray:

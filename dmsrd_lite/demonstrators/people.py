@@ -24,10 +24,8 @@ def save_demonstrators(path: str | Path, actor: Actor, made_with: str = "") -> P
     """Write policies (safetensors, atomically); ``made_with`` says how they were made."""
     from safetensors.numpy import save
 
-    arrays = {f"weights.{i}": w for i, w in enumerate(actor.weights)}
-    arrays |= {f"biases.{i}": b for i, b in enumerate(actor.biases)} | {"sigma": actor.sigma}
     header = {"format": _FORMAT, "domain": actor.domain.name, "made_with": made_with}
-    binary = save({k: np.ascontiguousarray(v) for k, v in arrays.items()}, metadata=header)
+    binary = save({k: np.ascontiguousarray(v) for k, v in actor.arrays().items()}, metadata=header)
     return write_atomically(path, lambda file: file.write(binary))
 
 
@@ -42,10 +40,7 @@ def load_demonstrators(path: str | Path, domain: Domain, n_people: int = 0) -> t
         raise InputError(f"{path}: is a {header.get('format')!r}; expected {_FORMAT!r}")
     if header["domain"] != domain.name:
         raise InputError(f"{path}: holds demonstrators of {header['domain']}; expected {domain.name}")
-    weights, biases = (
-        [arrays[f"{part}.{i}"] for i in range(len(arrays) // 2)] for part in ("weights", "biases")
-    )
-    actor = Actor(domain, weights, biases, arrays["sigma"])
+    actor = Actor.from_arrays(domain, arrays)
     if actor.n_strategies < n_people:
         expected = f"expected at least {n_people}, one for each demonstration"
         raise InputError(f"{path}: holds {actor.n_strategies} demonstrators; {expected}")

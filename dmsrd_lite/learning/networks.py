@@ -59,9 +59,10 @@ class BatchedMLP(torch.nn.Module):
         return self.weights[0].shape[0]
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+        *hidden, (last_weight, last_bias) = zip(self.weights, self.biases, strict=True)
+        for weight, bias in hidden:  # slices of a ParameterList would be new modules, which takes longer
             x = torch.tanh(torch.baddbmm(bias, x, weight))
-        return torch.baddbmm(self.biases[-1], x, self.weights[-1])
+        return torch.baddbmm(last_bias, x, last_weight)
 
 
 def gaussian_log_density(actions: Any, mean: Any, sigma: Any) -> Any:
@@ -142,6 +143,19 @@ class Actor(Policies):
         weights = [np.concatenate(layer) for layer in zip(*(a.weights for a in actors), strict=True)]
         biases = [np.concatenate(layer) for layer in zip(*(a.biases for a in actors), strict=True)]
         return cls(actors[0].domain, weights, biases, np.concatenate([a.sigma for a in actors]))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that makes these policies, by name, for a file."""
+        layers = {"weights": self.weights, "biases": self.biases}
+        found = {f"{part}.{i}": array for part, arrays in layers.items() for i, array in enumerate(arrays)}
+        return {**found, "sigma": self.sigma}
+
+    @classmethod
+    def from_arrays(cls, domain: Domain, arrays: dict[str, np.ndarray]) -> "Actor":
+        """The policies that ``arrays`` names."""
+        n_layers = len(arrays) // 2
+        weights, biases = ([arrays[f"{part}.{i}"] for i in range(n_layers)] for part in ("weights", "biases"))
+        return cls(domain, weights, biases, arrays["sigma"])
 
     def mean(self, observations: np.ndarray) -> np.ndarray:
         x = self.domain.network_input(observations)

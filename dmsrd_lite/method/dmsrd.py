@@ -46,8 +46,7 @@ class DMSRDSettings:
     policies_after_new: bool = True  # policies learn in the round after a new strategy (the paper) ...
     policies_after_mixture: bool = True  # ... and in that after a mixture (the paper), or only rewards do
     remembered: int = 0  # how many earlier mixtures a round works on (``rounds.remembered``); 0: all
-    measured_rollouts: int = 10  # for the KL before and after a round
-    audit_every: int = 0  # measure KL and recognition of all demonstrations after every so many; 0: never
+    measured_rollouts: int = 10  # for the KL before and after a round; 0: not measured, nobody searched again
 
     def __post_init__(self) -> None:
         if self.kl_threshold < 0 or not np.isfinite(self.kl_threshold):
@@ -90,8 +89,6 @@ def learn(state: State, demonstrations: DemonstrationSet, settings: DMSRDSetting
     _check(state, demonstrations, settings)
     for i in range(demonstrations.n_demonstrations):
         state = learn_one(state, demonstrations.select([i]), settings)
-        if settings.audit_every and len(state.records) % settings.audit_every == 0:
-            state = _audited(state, settings)
         yield state
 
 
@@ -153,11 +150,3 @@ def _check(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> None
     if state.form not in ("", settings.form):
         text = f"a state that was learned {state.form} cannot go on {settings.form}; expected the same form"
         raise InputError(text)
-
-
-def _audited(state: State, settings: DMSRDSettings) -> State:
-    """With the KL and the recognition of everybody so far in the last record."""
-    everyone, seed = np.arange(len(state.weights)), [state.seed, 102, len(state.weights) - 1, 8]
-    kl = state.divergences(everyone, seed, settings.measured_rollouts)
-    audit = plain({"kl": kl, "recognized": state.recognized(everyone)})
-    return replace(state, records=(*state.records[:-1], {**state.records[-1], "audit": audit}))

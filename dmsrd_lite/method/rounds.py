@@ -33,7 +33,8 @@ def play_round(
     searched: dict[int, list[float]] = {}
 
     def measure() -> np.ndarray:
-        return state.divergences(some, [*seed, 3], s.measured_rollouts) if moving else np.zeros(0)
+        n = s.measured_rollouts if moving else 0
+        return state.divergences(some, [*seed, 3], n) if n else np.zeros(0)
 
     before = after = measure()
     if len(pure) > 1:

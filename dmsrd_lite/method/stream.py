@@ -1,11 +1,12 @@
 """A stream that survives being killed: states as files, Algorithm 1 with a checkpoint after every user."""
 
+import hashlib
 import json
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from dmsrd_lite.demonstrations import DemonstrationSet, check_folder, plain, read_tensors, write_atomically
@@ -15,6 +16,7 @@ from dmsrd_lite.method.dmsrd import DMSRDSettings, learn
 from dmsrd_lite.method.state import State
 
 _FORMAT, _VERSION = "dmsrd_lite state", 3
+_JOURNAL = "records.jsonl"
 
 
 def save_state(path: str | Path, state: State) -> Path:
@@ -50,36 +52,83 @@ def load_state(path: str | Path, domain: Domain) -> State:
 
 
 def learn_stream(
-    state: State, shown: DemonstrationSet, settings: DMSRDSettings, folder: str | Path, source: str = ""
+    state: State,
+    shown: DemonstrationSet,
+    settings: DMSRDSettings,
+    folder: str | Path,
+    source: str = "",
+    kept: Sequence[int] = (),
 ) -> Iterator[State]:
     """``learn`` with a checkpoint in ``folder`` after every demonstration; goes on from the newest that can
     be read.
 
     Killed at any moment and called again with the same arguments, it redoes at most the demonstration that
     was in flight and ends with the bits of an uninterrupted run. Two files take turns: one that was spoiled
-    costs one demonstration. Yields the newest state of earlier calls first, if there is one. ``InputError``
-    when the folder holds another stream, or one of another ``source`` (of the code: ``records.source_hash``).
+    costs one demonstration. A checkpoint holds neither demonstrations (``shown`` has them) nor records (each
+    is a line of ``records.jsonl``), so its size grows by M weights a user only. After ``kept`` demonstrations
+    a copy stays, for ``kept_states``.
+
+    Yields the newest state of earlier calls first, if there is one. ``InputError`` when the folder holds
+    another stream, or one of another ``source`` (of the code: ``records.source_hash``).
     """
-    folder, states = Path(folder).resolve(), [state]
-    check_folder(folder / "any")
-    made_with, note = repr((state.domain.name, state.seed, settings, source)), folder / "settings.txt"
+    folder, digests = Path(folder).resolve(), _digests(shown)
+    journal, note = check_folder(folder / _JOURNAL), folder / "settings.txt"
+    made_with = repr((state.domain.name, state.seed, settings, source))
     if note.exists() and note.read_text() != made_with:
         text = "holds checkpoints of another seed, other settings or other code; expected another folder"
         raise InputError(f"{folder}: {text}")
+    if state.records and _digests(state.shown) != digests[: len(state.records)]:
+        raise InputError("a state that knows other demonstrations; expected those that were shown first")
     write_atomically(note, lambda file: file.write(made_with.encode()))
-    for path in sorted(folder.glob("checkpoint_*.safetensors")):
-        try:
-            states.append(load_state(path, state.domain))
-        except InputError as error:
-            warnings.warn(f"{error}; going on from the checkpoint before it", stacklevel=2)
-    state = max(states, key=lambda known: len(known.records))
-    n = len(state.records)
-    known, given = state.shown.arrays() if n else {}, shown.arrays()
-    if any(name not in given or not np.array_equal(a, given[name][:n]) for name, a in known.items()):
-        text = "holds checkpoints of other demonstrations; expected another folder"
-        raise InputError(f"{folder}: {text}")
+    state = max([state, *_found(folder, "checkpoint_*", shown)], key=lambda known: len(known.records))
+    n, total = len(state.records), shown.n_demonstrations
+    lines = [json.dumps(pair) + "\n" for pair in zip(digests[:n], state.records, strict=True)]
+    write_atomically(journal, lambda file: file.write("".join(lines).encode()))  # without one in flight
     if n:
         yield state
-    for after in learn(state, shown.select(range(n, shown.n_demonstrations)), settings):
-        save_state(folder / f"checkpoint_{len(after.records) % 2}.safetensors", after)
+    for after in learn(state, shown.select(range(n, total)), settings):
+        n, bare = len(after.records), replace(after, demonstrations=None, records=())
+        with journal.open("a") as file:
+            file.write(json.dumps([digests[n - 1], after.records[-1]]) + "\n")
+        for name in (f"checkpoint_{n % 2}", *([f"kept_{n:06}"] if n in kept else ())):
+            save_state(folder / f"{name}.safetensors", bare)
         yield after
+
+
+def kept_states(folder: str | Path, shown: DemonstrationSet) -> Iterator[State]:
+    """The states that ``learn_stream`` kept in ``folder``, in order; ``shown``: its demonstrations."""
+    yield from _found(Path(folder).resolve(), "kept_*", shown)
+
+
+def _found(folder: Path, pattern: str, shown: DemonstrationSet) -> Iterator[State]:
+    """What the files hold, with its demonstrations and records; a warning for each that cannot be used."""
+    records: list[dict] = []
+    digests = _digests(shown)
+    for line in (folder / _JOURNAL).read_text().splitlines() if (folder / _JOURNAL).exists() else ():
+        try:
+            digest, record = json.loads(line)
+        except ValueError:  # killed while it was written
+            break
+        if digests[len(records) : len(records) + 1] != [digest]:
+            text = "holds checkpoints of other demonstrations; expected another folder"
+            raise InputError(f"{folder}: {text}")
+        records.append(record)
+    for path in sorted(folder.glob(f"{pattern}.safetensors")):
+        try:
+            known = load_state(path, shown.domain)
+            if (n := len(known.weights)) > len(records):
+                raise InputError(f"{path}: knows {n} demonstrations; expected {n} lines in {_JOURNAL}")
+            yield replace(known, demonstrations=shown.select(range(n)), records=tuple(records[:n]))
+        except InputError as error:
+            warnings.warn(f"{error}; going on from the checkpoint before it", stacklevel=3)
+
+
+def _digests(shown: DemonstrationSet) -> list[str]:
+    """Of each demonstration: what it holds, by name."""
+    found = []
+    for i in range(shown.n_demonstrations):
+        digest = hashlib.sha256()
+        for name, array in sorted(shown.arrays().items()):
+            digest.update(name.encode() + array[i].tobytes())
+        found.append(digest.hexdigest()[:16])
+    return found

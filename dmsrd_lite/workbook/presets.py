@@ -286,16 +286,19 @@ class DMSRDLesson:  # 06
     def ablations(self) -> dict[str, DMSRDSettings]:
         """Ours (from a clone, where no start is named), with one deviation from the paper taken back at a
         time."""
-        printed = self.loop.as_printed()
-        names = "add_task_reward", "between_class", "own_rollouts", "search_again"
-        found = {f"{name} as printed": replace(self.loop, **{name: getattr(printed, name)}) for name in names}
-        by_states = replace(self.loop, mixture=replace(self.loop.mixture, from_actions=False))
-        found["from_actions as printed"] = by_states
-        nothing = self.forms["ours, nothing"]
+        found, nothing = taken_back(self.loop), self.forms["ours, nothing"]
         found["task_from_first as printed, nothing"] = replace(nothing, task_from_first=False)
         moving = replace(nothing, policies_after_new=True, policies_after_mixture=True)
         found["policies learn in rounds, nothing"] = moving
         return found | {"without BCD": replace(self.loop, between_class="never")}
+
+
+def taken_back(loop: DMSRDSettings) -> dict[str, DMSRDSettings]:
+    """A form of Algorithm 1 with one deviation from the paper taken back at a time."""
+    printed = loop.as_printed()
+    names = "add_task_reward", "between_class", "own_rollouts", "search_again"
+    found = {f"{name} as printed": replace(loop, **{name: getattr(printed, name)}) for name in names}
+    return found | {"from_actions as printed": replace(loop, mixture=printed.mixture)}
 
 
 BENCHMARK = {  # what each part trains: method, start
@@ -356,42 +359,56 @@ def _benchmark(domain: str, quick: bool) -> BenchmarkLesson:
 
 @dataclass(frozen=True)
 class LifelongLesson:  # 08
+    domain: str
     users: int
-    loop: DMSRDSettings
-    cloning_steps: int  # of clones of the base users
+    ours: DMSRDSettings  # from a clone
+    printed: DMSRDSettings  # from nothing
+    kept: tuple[int, ...]  # after so many users we look at what is known, ...
+    taught: tuple[int, ...]  # ... and after so many train fresh policies on R_Task
+    fresh: TrainingSettings
+    n_fresh: tuple[int, ...]  # fresh takes on which recognition is measured
     n_base: int = 5
-    n_many: int = 1000  # users who are explained and not learned from ...
-    short: int = 200  # ... by demonstrations of so many steps
-    few: MixtureSettings = MixtureSettings(
-        8, 4, search_rollouts=1, n_finalists=2, final_rollouts=2, from_actions=True
-    )
-    search: MixtureSettings = MixtureSettings(n_candidates=10, n_refinements=4)  # beside weights from actions
+    n_sample: int = 30  # users whose KL is looked at
+    n_looks: int = 3  # rollouts for it
+    n_ablated: int = 40  # users of the ablations
+    n_orders: int = 20  # random orders ...
+    n_ordered: int = 25  # ... of so many users
+    n_many: int = 1000
+
+    @property
+    def forms(self) -> dict[str, DMSRDSettings]:
+        return {"ours": self.ours, "as printed": self.printed}
+
+    @property
+    def ablations(self) -> dict[str, DMSRDSettings]:
+        """Ours, with one deviation from the paper taken back at a time."""
+        loop = self.ours
+        found = {"as it is": loop, **taken_back(loop), "all are remembered": replace(loop, remembered=0)}
+        return found | {"policies learn after mixtures": replace(loop, policies_after_mixture=True)}
 
 
 def _lifelong(domain: str, quick: bool) -> LifelongLesson:
-    usual = METHODS[domain].dmsrd
-    mixture = MixtureSettings(n_candidates=24, n_refinements=16, from_actions=True)
-    loop = replace(
-        usual,
-        kl_margin={PENDULUM: 1.0, LANDER: 2.5}[domain],
-        remembered=10,
-        measured_rollouts=3,
-        audit_every=10,
-        policies_after_mixture=False,
-        msrd=replace(usual.msrd, n_iterations=3),
-        mixture=mixture,
-    )
-    if (
-        domain == PENDULUM
-    ):  # the lander clones every user, for the reference; here only a new strategy pays for it
-        loop = replace(loop, airl=replace(loop.airl, cloning_steps=6000))
+    margin = {PENDULUM: 1.0, LANDER: 2.5}[domain]
+    ours = replace(METHODS[domain].dmsrd, remembered=10, measured_rollouts=3, policies_after_mixture=False)
+    printed = replace(METHODS_FROM_NOTHING[domain].dmsrd.as_printed(), measured_rollouts=0)
+    ours, printed = (replace(loop, kl_margin=margin) for loop in (ours, printed))
     if not quick:
-        return LifelongLesson(100, loop, cloning_steps=6000)
+        looks = (5, *range(10, 101, 10))
+        return LifelongLesson(
+            domain, 100, ours, printed, looks, (5, 25, 50, 100), _fresh(domain), (3, 10, 30)
+        )
     airl = AIRLSettings(n_iterations=1, episodes=4, cloning_steps=1500, coverage_episodes=1)
-    mixture = replace(mixture, n_candidates=8, n_refinements=4, n_finalists=2)
-    msrd = replace(loop.msrd, n_iterations=2, episodes=2)
-    loop = replace(loop, airl=airl, msrd=msrd, mixture=mixture, audit_every=3)
-    return LifelongLesson(6, loop, cloning_steps=1500, n_many=20)
+    ours = replace(ours, airl=airl, own_rollouts=5)
+    printed = replace(printed, airl=replace(printed.airl, n_iterations=10))
+    ours, printed = (
+        replace(
+            loop,
+            msrd=replace(loop.msrd, n_iterations=2, episodes=2),
+            mixture=replace(loop.mixture, n_candidates=8, n_refinements=4, n_finalists=2),
+        )
+        for loop in (ours, printed)
+    )
+    return LifelongLesson(domain, 6, ours, printed, (3, 6), (), _fresh(domain), (3, 10))
 
 
 @dataclass(frozen=True)
@@ -512,8 +529,7 @@ KNOBS: dict[str, dict[str, Knob]] = {
         "between_class_weight": Knob("msrd.between_class_weight", 0, 1e6, 10.0),
         "n_iterations": Knob("msrd.n_iterations", 1, 10_000)},
     "06_dmsrd": {"kl_threshold": Knob("loop.kl_threshold", 1e-6, 1e9)},
-    "08_lifelong_100": {"users": Knob("users", 10, 100), "remembered": Knob("loop.remembered", 0, 100, 10),
-                        "moving": Knob("loop.policies_after_mixture", 0, 1, False)},
+    "08_lifelong_100": {"users": Knob("users", 6, 100)},
 }  # fmt: skip
 
 

@@ -27,11 +27,23 @@ SHOWN = {
     "spearman": "Spearman",
     "spearman_of_good": "Spearman among those that do not fail",
     "steps": "steps in all",
+    "strategies": "strategies",
     "recognized_on_shown": "recognised on what was shown (share)",
     **{f"recognized_on_{k}": f"on {k} fresh takes" for k in (3, 10, 30)},
     "weight_error": "error of the weights",
 }
-NO_METRICS = ("curve", "curves", "decisions", "branches", "pure", "weights", "paid", "paid_shown")
+NO_METRICS = (
+    "curve",
+    "curves",
+    "decisions",
+    "branches",
+    "pure",
+    "weights",
+    "paid",
+    "paid_shown",
+    "order",
+    "kept",
+)
 COLUMNS = ("record", "lesson", "domain", "seed", "method", "metric", "value")
 
 
@@ -73,7 +85,15 @@ def _numbers(record: dict, domain: Domain) -> Iterator[tuple[str, str, Any]]:
             for budget, scores in by_budget.items():
                 yield from _scores(f"{method}, {int(budget) / 1e6:g} M steps", scores, domain, *known)
         return
+    if "lived" in r:  # lesson 08, a thousand users: one row each
+        yield "ours, a thousand users", "strategies", len(r["pure"])
+        yield "ours, a thousand users", "pearson", r["looks"][-1]["pearson"]
+        return
     floor, own = np.array(r["floor"]), np.array(r["own_log_likelihood"])
+    for k, scores in enumerate(r.get("orders", ())):
+        yield from _scores(f"ours, order {k}", scores, domain, floor[scores["order"]], own[scores["order"]])
+    if "orders" in r:
+        return
     yield "demonstrator", "divergence", floor
     yield "demonstrator", "log_likelihood_per_step", own
     for method, scores in r.get("table", {}).items():
@@ -100,6 +120,8 @@ def _scores(
         elif metric not in NO_METRICS:
             yield method, metric, value
     yield method, "able", able(domain, scores)
+    if scores.get("pure") is not None and "branches" in scores:  # Algorithm 1
+        yield method, "strategies", len(scores["pure"])
     if floor is not None and own is not None:
         yield method, "divergence_above_floor", np.subtract(scores["divergence"], floor)
         yield method, "log_likelihood_above_own", np.subtract(scores["log_likelihood_per_step"], own)

@@ -26,11 +26,19 @@ def film(
     return np.array(frames)
 
 
+def picture(frame: np.ndarray) -> bytes:
+    """A frame (height, width, 3) as a PNG file."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(frame).save(file, "png")
+    return file.getvalue()
+
+
 def show_video(frames: np.ndarray, frames_per_second: float) -> Any:
     """An MP4 inside the notebook, as wide as fits; its first frame stands before it is played."""
     import imageio_ffmpeg
     from IPython.display import HTML
-    from PIL import Image
 
     height, width = frames.shape[1] // 2 * 2, frames.shape[2] // 2 * 2
     with tempfile.TemporaryDirectory() as folder:
@@ -44,9 +52,7 @@ def show_video(frames: np.ndarray, frames_per_second: float) -> Any:
         writer.close()
         with open(path, "rb") as file:
             video = base64.b64encode(file.read()).decode()
-    picture = io.BytesIO()
-    Image.fromarray(frames[0]).save(picture, "png")
-    poster = base64.b64encode(picture.getvalue()).decode()
+    poster = base64.b64encode(picture(frames[0])).decode()
     style = "max-width:100%; padding-bottom:40px; background:white"  # the controls stand below the picture
     return HTML(
         f'<video controls loop muted width="{width}" style="{style}" poster="data:image/png;base64,{poster}" '

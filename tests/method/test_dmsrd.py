@@ -292,10 +292,3 @@ def test_optional_fields_may_be_missing(three, states):
     state = after(states[2], bare)
     assert state.shown.arrays().keys() == {"observations", "actions"}
     assert same(state.networks, states[3].networks), "nothing is learned from them"
-
-
-def test_an_audit_measures_everybody(three, states):
-    state = after(states[2], three.select([2, 2]), replace(GENEROUS, remembered=1, audit_every=2))
-    assert "audit" not in state.records[2]
-    kl, recognized = state.divergences(range(4), [0, 102, 3, 8], 2), state.recognized(range(4))
-    assert state.records[3]["audit"] == {"kl": kl.tolist(), "recognized": recognized.tolist()}

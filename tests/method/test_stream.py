@@ -13,7 +13,7 @@ from tiny import GENEROUS, PENDULUM, TINY, assert_same, forbid, three_users
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.method import dmsrd, rounds, stream
 from dmsrd_lite.method.state import State
-from dmsrd_lite.method.stream import learn_stream, load_state, save_state
+from dmsrd_lite.method.stream import kept_states, learn_stream, load_state, save_state
 
 STREAM = """
 import sys
@@ -44,7 +44,19 @@ def kill(process, at, seconds):
 
 def newest(folder):
     states = [load_state(path, PENDULUM) for path in folder.glob("checkpoint_*.safetensors")]
-    return max(states, key=lambda state: len(state.records))
+    return max(states, key=lambda state: len(state.weights))
+
+
+def bare(state):
+    """As a checkpoint holds it."""
+    return replace(state, demonstrations=None, records=())
+
+
+def keep(folder, *states):
+    """Checkpoints and journal as a stream leaves them after these states."""
+    next(learn_stream(states[-1], states[-1].shown, TINY, folder))  # writes the journal
+    for state in states:
+        save_state(folder / f"checkpoint_{len(state.records) % 2}.safetensors", bare(state))
 
 
 def test_round_trip(states, tmp_path):
@@ -103,14 +115,13 @@ def test_saving_replaces_the_whole_file_or_nothing(states, tmp_path):
 def test_killed_once_a_stream_ends_with_the_same_bits(three, states, tmp_path, monkeypatch):
     kill(start(tmp_path, "012"), 1, 0.1)
     kept = newest(tmp_path)
-    assert len(kept.records) >= 1
+    assert len(kept.weights) >= 1
     first, *more = learn_stream(State(PENDULUM, 0), three, TINY, tmp_path)
-    assert_same(first, kept)
-    assert first.records == kept.records
-    assert len(more) == 3 - len(kept.records)
-    for state in (more[-1] if more else first, newest(tmp_path)):
-        assert_same(state, states[3])
-    names = ["checkpoint_0.safetensors", "checkpoint_1.safetensors", "settings.txt"]
+    assert_same(bare(first), kept)
+    assert len(first.records) == len(kept.weights) == 3 - len(more)
+    assert_same(more[-1] if more else first, states[3])
+    assert_same(newest(tmp_path), bare(states[3]))
+    names = ["checkpoint_0.safetensors", "checkpoint_1.safetensors", "records.jsonl", "settings.txt"]
     assert sorted(p.name for p in tmp_path.iterdir()) == names
     forbid(monkeypatch, (dmsrd, "AIRL"), (rounds, "MSRD"))
     (ended,) = learn_stream(State(PENDULUM, 0), three, TINY, tmp_path)
@@ -124,21 +135,41 @@ def test_killed_at_random_moments_a_stream_ends_with_the_same_bits(tmp_path):
     *_, whole = learn_stream(State(PENDULUM, 0), shown, TINY, tmp_path / "whole")
     for at in sorted(rng.choice(np.arange(1, 7), 3, replace=False)):
         kill(start(tmp_path / "killed", users), at, rng.uniform(0, 0.5))
-        assert len(newest(tmp_path / "killed").records) >= max(done, at)
-        done = len(newest(tmp_path / "killed").records)
+        assert len(newest(tmp_path / "killed").weights) >= max(done, at)
+        done = len(newest(tmp_path / "killed").weights)
     lines, _ = start(tmp_path / "killed", users).communicate()
     assert [int(line) for line in lines.split()] == list(range(done, 9))
-    assert_same(newest(tmp_path / "killed"), whole)
+    assert_same(newest(tmp_path / "killed"), bare(whole))
 
 
 def test_a_spoiled_checkpoint_costs_one_demonstration(three, states, tmp_path):
-    save_state(tmp_path / "checkpoint_0.safetensors", states[2])
-    last = save_state(tmp_path / "checkpoint_1.safetensors", states[3])
+    keep(tmp_path, states[2], states[3])
+    last = tmp_path / "checkpoint_1.safetensors"
     last.write_bytes(last.read_bytes()[:-100])
     sentence = r"1\.safetensors: cannot be read .*; going on from the checkpoint before it$"
     with pytest.warns(UserWarning, match=sentence):
         found = list(learn_stream(State(PENDULUM, 0), three, TINY, tmp_path))
-    for state, known in zip((*found, load_state(last, PENDULUM)), (*states[2:], states[3]), strict=True):
+    for state, known in zip(found, states[2:], strict=True):
+        assert_same(state, known)
+        assert state.records[:2] == states[2].records
+    assert_same(load_state(last, PENDULUM), bare(states[3]))
+
+
+def test_a_journal_cut_short_costs_one_demonstration(three, states, tmp_path):
+    keep(tmp_path, states[2], states[3])
+    journal = tmp_path / "records.jsonl"
+    journal.write_text(journal.read_text()[:-20])
+    sentence = r"1\.safetensors: knows 3 demonstrations; expected 3 lines in records.jsonl; going on"
+    with pytest.warns(UserWarning, match=sentence):
+        first, last = learn_stream(State(PENDULUM, 0), three, TINY, tmp_path)
+    assert_same(first, states[2])
+    assert_same(last, states[3])
+    assert len(journal.read_text().splitlines()) == 3
+
+
+def test_states_that_are_kept_hold_all_that_was_known(three, states, tmp_path):
+    list(learn_stream(State(PENDULUM, 0), three, TINY, tmp_path, kept=(1, 3)))
+    for state, known in zip(kept_states(tmp_path, three), states[1::2], strict=True):
         assert_same(state, known)
 
 
@@ -156,7 +187,12 @@ OTHERS = {
 def test_a_folder_of_another_stream_is_refused(other, three, states, tmp_path):
     change, sentence = OTHERS[other]
     given = {"state": State(PENDULUM, 0), "shown": three, "settings": TINY, "folder": tmp_path}
-    save_state(tmp_path / "checkpoint_0.safetensors", states[2])
+    keep(tmp_path, states[2])
     next(learn_stream(**given))
     with pytest.raises(InputError, match=f"^{tmp_path}: holds checkpoints of {sentence}; expected [^\n]*$"):
         next(learn_stream(**{**given, **change}))
+
+
+def test_a_state_of_other_demonstrations_cannot_go_on(three, states, tmp_path):
+    with pytest.raises(InputError, match=r"^a state that knows other demonstrations; expected [^\n]*$"):
+        next(learn_stream(states[1], three.select([1, 0]), TINY, tmp_path))
