@@ -389,7 +389,15 @@ class LifelongLesson:  # 08
 
 def _lifelong(domain: str, quick: bool) -> LifelongLesson:
     margin = {PENDULUM: 1.0, LANDER: 2.5}[domain]
-    ours = replace(METHODS[domain].dmsrd, remembered=10, measured_rollouts=3, policies_after_mixture=False)
+    usual = METHODS[domain].dmsrd
+    ours = replace(
+        usual,
+        remembered=10,
+        measured_rollouts=3,
+        policies_after_mixture=False,
+        own_rollouts={PENDULUM: 5, LANDER: 10}[domain],  # from other starts in every round
+        msrd=replace(usual.msrd, n_iterations=3),
+    )
     printed = replace(METHODS_FROM_NOTHING[domain].dmsrd.as_printed(), measured_rollouts=0)
     ours, printed = (replace(loop, kl_margin=margin) for loop in (ours, printed))
     if not quick:
