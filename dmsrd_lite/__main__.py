@@ -49,7 +49,8 @@ def _convert(arguments: argparse.Namespace) -> int:
     found, notes = convert(arguments.source, domain, arguments.each, arguments.steps)
     path = save_demonstrations(arguments.file, found)
     n, k, t = found.actions.shape[:3]
-    print(*notes, f"{path}: {n} demonstrations of {k} trajectories, {t} steps, {found.domain.name}", sep="\n")
+    what = f"{n} demonstration{'s' * (n > 1)} of {k} trajector{'ies' if k > 1 else 'y'}, {t} steps"
+    print(*notes, f"{path}: {what}, {found.domain.name}", sep="\n")
     return 0
 
 

@@ -65,6 +65,10 @@ class DemonstrationSet:
         """The fields that are there, by name."""
         return {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
 
+    def faults(self) -> list[str]:
+        """One sentence for every fault; an empty list when the set can be used."""
+        return _check_demonstrations(self.arrays(), self.domain)
+
     def select(self, indices: Sequence[int] | np.ndarray) -> "DemonstrationSet":
         """The demonstrations ``indices`` (a list), in that order."""
         chosen: dict[str, Any] = {name: array[list(indices)] for name, array in self.arrays().items()}
@@ -357,8 +361,7 @@ def read_tensors(
 def save_demonstrations(path: str | Path, demonstrations: DemonstrationSet) -> Path:
     """Write a demonstration set (checked first, atomically, compressed, without pickle)."""
     arrays, domain = demonstrations.arrays(), demonstrations.domain
-    faults = _check_demonstrations(arrays, domain)
-    if faults:
+    if faults := demonstrations.faults():
         raise InputError(f"{Path(path).resolve()}: {faults[0]}")
     metadata = {**demonstrations.metadata, "domain": domain.name, "schema_version": SCHEMA_VERSION}
     content: dict[str, Any] = {**arrays, "metadata": np.array(json.dumps(metadata))}

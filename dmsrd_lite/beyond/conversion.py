@@ -62,7 +62,10 @@ def convert(
         notes.append("there are no rewards: returns are unknown, and nothing that learns needs them")
     if each == 1:
         notes.append("one trajectory per person: how far it is from itself is unknown (lesson 06, eps)")
-    return DemonstrationSet(domain, **kept, metadata={"source": path.name}), notes
+    found = DemonstrationSet(domain, **kept, metadata={"source": path.name})
+    if faults := found.faults():
+        raise InputError(f"{path}: {faults[0]}")
+    return found, notes
 
 
 def _stack(parts: Sequence[np.ndarray], each: int, n: int) -> np.ndarray:

@@ -128,15 +128,16 @@ def likeliest_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarr
 def weight_deviations(actor: Actor, demonstration: DemonstrationSet, weights: ArrayLike) -> np.ndarray:
     """How well actions could tell the weights at best: the Cramer-Rao bound of their deviations, (M,).
 
-    ``I = sum_t Delta(s_t) Delta(s_t)^T / sigma_w^2`` with ``Delta_j = mu_j - sum_k w_k mu_k``: weights move
-    within the simplex, ``sum_j d_j = 0``. Where two people act alike everywhere it is huge: nobody can say
-    whose share it is. It holds for known means; those of learned policies are wrong by more.
+    ``I = sum_t (Delta Delta^T + 2 Gamma Gamma^T) / sigma_w^2`` with ``Delta_j = mu_j - sum_k w_k mu_k`` and
+    ``Gamma_j = sigma_j - sum_k w_k sigma_k``: where somebody acts tells their weights, and how widely.
+    Weights move within the simplex, ``sum_j d_j = 0``. Where two people act alike everywhere it is huge:
+    nobody can say whose share it is. It holds for known policies; learned ones are wrong by more.
     """
     w = check_weights(weights, actor.n_strategies)[0]
     _, mu, sigma = (x.astype(np.float64) for x in inside_bounds(actor, demonstration))
-    scaled = (mu - w @ mu) / (w @ sigma)  # (M, N)
+    where, how_widely = (mu - w @ mu) / (w @ sigma), sigma / (w @ sigma) - 1  # (M, N)
     along = null_space(np.ones((1, len(w))))  # (M, M - 1): directions within the simplex
-    information = along.T @ (scaled @ scaled.T) @ along
+    information = along.T @ (where @ where.T + 2 * how_widely @ how_widely.T) @ along
     values, directions = np.linalg.eigh(information)
     spread = (along @ directions) / np.sqrt(np.maximum(values, 1e-12 * values.max()))  # (M, M - 1)
     return np.sqrt((spread**2).sum(1))

@@ -19,11 +19,16 @@ import pandas as pd
 
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.workbook.lessons import NOTEBOOKS
+from dmsrd_lite.workbook.records import ROOT
 
 SOLUTIONS = NOTEBOOKS / "exercises" / "solutions"
 SETTINGS = '''"""nbgrader's settings of a course with the exercises of dmsrd_lite."""
 
+from nbconvert.preprocessors import CSSHTMLHeaderPreprocessor
+from nbgrader.preprocessors import ClearHiddenTests, GetGrades
+
 c = get_config()
+c.GenerateFeedback.preprocessors = [GetGrades, ClearHiddenTests, CSSHTMLHeaderPreprocessor]
 c.CourseDirectory.course_id = "dmsrd_lite"
 c.ClearSolutions.code_stub = {"python": 'raise NotImplementedError("not yet")'}
 c.ClearSolutions.text_stub = "*Your answer.*"
@@ -47,6 +52,8 @@ def release(course: str | Path, lessons: Sequence[str] = ()) -> list[Path]:
     for lesson in lessons:
         if lesson not in known:
             raise InputError(f"{lesson} has no exercise; expected one of {', '.join(known)}")
+    if course.is_relative_to(ROOT):
+        raise InputError(f"{course} is inside of this repository; expected a folder outside")
     settings = course / "nbgrader_config.py"
     if course.is_dir() and any(course.iterdir()) and not settings.exists():
         raise InputError(
@@ -114,8 +121,7 @@ def inspect(path: Path) -> tuple[str, bool]:
         notebook = nbformat.read(path, 4)
     except Exception as error:
         return f"does not open as a notebook ({type(error).__name__})", False
-    cells = [cell.metadata.get("nbgrader", {}).get("grade_id") for cell in notebook.cells]
-    cells = [name for name in cells if name]
+    cells = [name for name in map(task_of, notebook.cells) if name]
     if not cells:
         return "holds no task of the exercise; expected the copy that was handed out", False
     notes = []
@@ -127,21 +133,39 @@ def inspect(path: Path) -> tuple[str, bool]:
     return "; ".join(notes), True
 
 
-def _without_doubles(path: Path) -> nbformat.NotebookNode:
-    """A submission in which each task's cell is the first of its name; what is there again is plain code."""
-    notebook, seen = nbformat.read(path, 4), set()
+def task_of(cell: nbformat.NotebookNode) -> str | None:
+    return cell.metadata.get("nbgrader", {}).get("grade_id")
+
+
+def mended(path: Path, handed_out: Path) -> tuple[nbformat.NotebookNode, list[str]]:
+    """A submission as it can be graded, and the names of the cells that were missing.
+
+    Each task's cell is the first of its name; what is there again is plain code. A check that is missing is
+    put back before the next task. An answer is not: a stub might hide what stands in another cell.
+    """
+    notebook, seen, gone = nbformat.read(path, 4), set(), []
     for cell in notebook.cells:
-        name = cell.metadata.get("nbgrader", {}).get("grade_id")
-        if name in seen:
+        if (name := task_of(cell)) in seen:
             del cell.metadata["nbgrader"]
         seen |= {name} - {None}
-    return notebook
+    place = len(notebook.cells)
+    for cell in reversed(nbformat.read(handed_out, 4).cells):
+        names = [task_of(one) for one in notebook.cells]
+        if (name := task_of(cell)) in names:
+            place = names.index(name) if name else place
+        elif name:
+            gone.append(name)
+            if not cell.metadata["nbgrader"]["solution"]:
+                notebook.cells.insert(place, cell)
+    return notebook, gone[::-1]
 
 
 def grade(course: str | Path, submissions: str | Path, progress: Callable = iter) -> Path:
     """Grade every notebook under ``submissions``; the table of ``report``."""
     course = _course(course)
     found, notes = find_submissions(submissions)
+    here = {one.student for one in found} | {note["student"] for note in notes}
+    notes += [note for note in _notes(course) if note["student"] not in here]
     os.environ["PYTHONWARNINGS"] = "ignore"  # nbgrader takes a warning for a wrong answer
     api = _nbgrader(course)
     for student, lesson, path in progress(found):
@@ -152,7 +176,10 @@ def grade(course: str | Path, submissions: str | Path, progress: Callable = iter
             place = course / "submitted" / student / lesson
             shutil.rmtree(place, ignore_errors=True)
             place.mkdir(parents=True)
-            nbformat.write(_without_doubles(path), place / f"{lesson}.ipynb")
+            notebook, gone = mended(path, course / "release" / lesson / f"{lesson}.ipynb")
+            if gone:
+                text = f"{text}; " * bool(text) + f"missing: {', '.join(gone)}; checks were put back"
+            nbformat.write(notebook, place / f"{lesson}.ipynb")
             answer = api.autograde(lesson, student)
             if answer["success"]:
                 api.generate_feedback(lesson, student)
@@ -176,14 +203,18 @@ def report(course: str | Path) -> Path:
             for one in assignment.submissions:
                 to_read = one.max_written_score if one.needs_manual_grade else 0
                 rows.append((one.student.id, assignment.name, one.score, assignment.max_score, to_read))
-    columns = ["student", "lesson", "points", "of", "to_read"]
-    table, noted = pd.DataFrame(rows, columns=columns), course / "notes.csv"
-    if noted.exists():
-        notes = pd.read_csv(noted, dtype=str, keep_default_na=False)
-        notes = notes.groupby(["student", "lesson"], as_index=False).note.agg("; ".join)
+    table = pd.DataFrame(rows, columns=["student", "lesson", "points", "of", "to_read"])
+    if noted := _notes(course):
+        notes = pd.DataFrame(noted).groupby(["student", "lesson"], as_index=False).note.agg("; ".join)
         table = table.merge(notes, "outer", ["student", "lesson"])
     table.sort_values(["lesson", "student"]).to_csv(course / "grades.csv", index=False)
     return course / "grades.csv"
+
+
+def _notes(course: Path) -> list[dict[str, str]]:
+    """What was noticed so far: ``notes.csv``, one line each."""
+    path = course / "notes.csv"
+    return pd.read_csv(path, dtype=str, keep_default_na=False).to_dict("records") if path.exists() else []
 
 
 def _course(course: str | Path) -> Path:

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -28,17 +27,17 @@ CONFIG = {  # nbgrader's panels want a course and show errors without one; Markd
 
 
 def open_lab(as_root: bool = False) -> int:
-    """Copy the lessons to ``my_notebooks`` if need be, and open JupyterLab on them; its exit code."""
+    """Copy the lessons to ``my_notebooks`` if need be, and become JupyterLab on them: it gets signals."""
     if hasattr(os, "geteuid") and os.geteuid() == 0 and not as_root:
         text = (
             "JupyterLab does not start as root: expected another user, or 'python -m dmsrd_lite lab --root'"
         )
         raise InputError(f"{text} ('make lab ROOT=--root') if you know that nobody else reaches this machine")
-    print(copy_lessons())
+    print(copy_lessons(), flush=True)
     configure()
     page = f"--LabApp.default_url=/lab/tree/{MINE.name}/START.md"
     command = [sys.executable, "-m", "jupyterlab", f"--ServerApp.root_dir={ROOT}", page]
-    return subprocess.call([*command, *(["--allow-root"] if as_root else [])])
+    os.execv(sys.executable, [*command, *(["--allow-root"] if as_root else [])])
 
 
 def configure() -> None:

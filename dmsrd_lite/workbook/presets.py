@@ -401,7 +401,7 @@ def _lifelong(domain: str, quick: bool) -> LifelongLesson:
     printed = replace(METHODS_FROM_NOTHING[domain].dmsrd.as_printed(), measured_rollouts=0)
     ours, printed = (replace(loop, kl_margin=margin) for loop in (ours, printed))
     if not quick:
-        looks = (5, *range(10, 101, 10))
+        looks = (5, 10, 20, 25, *range(30, 101, 10))
         return LifelongLesson(
             domain, 100, ours, printed, looks, (5, 25, 50, 100), _fresh(domain), (3, 10, 30)
         )

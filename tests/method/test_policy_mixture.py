@@ -165,6 +165,17 @@ def test_where_two_people_act_alike_nobody_can_say_whose_share_it_is():
     assert min(alike, alike_too) > 100 * other
 
 
+def test_the_bound_knows_that_sigma_tells():
+    """Closed form for equal means: ``sigma_w / (|sigma_0 - sigma_1| sqrt(2 N))``."""
+    one = balancers([0.0], sigma=0.1)
+    actor = Actor.joined([one, one.select([0], 3.0)])
+    shown = shown_by(Mixtures(actor, [[0.4, 0.6]]), 200)
+    n = policy_mixture.inside_bounds(actor, shown)[0].size
+    narrow, wide = actor.sigma.ravel()
+    expected = (0.4 * narrow + 0.6 * wide) / ((wide - narrow) * np.sqrt(2 * n))
+    assert policy_mixture.weight_deviations(actor, shown, [0.4, 0.6]) == pytest.approx([expected] * 2)
+
+
 def test_policies_of_another_domain_cannot_explain():
     lander = GaussianPolicies(LUNAR_LANDER, 2, 0).actor()
     with pytest.raises(

@@ -10,7 +10,7 @@ from records import stored
 from dmsrd_lite.demonstrators import people
 from dmsrd_lite.domains import DOMAINS
 from dmsrd_lite.evaluation import comparison, searches
-from dmsrd_lite.evaluation.metrics import reward_correlations, score_policies
+from dmsrd_lite.evaluation.metrics import demonstration_log_likelihood, reward_correlations, score_policies
 from dmsrd_lite.evaluation.worth import able
 from dmsrd_lite.learning.networks import under
 from dmsrd_lite.learning.policy_optimization import train_policies
@@ -178,3 +178,44 @@ def test_recorded_runs_of_algorithm_1_score_again_as_recorded(name):
         for k, found in means.items():
             assert recognized(found, known["pure"]).sum() == known["recognized_fresh"][str(k)], label
         assert n_strategies == learned.policies.n_strategies
+
+
+TRIALS = [name for name in of("08") if "_seed" in name and ("_ours_" in name or "_as_printed_" in name)]
+
+
+def lived(name):
+    """A trial of lesson 08: its record's scores, what it ended with, its users."""
+    record, tensors, domain, seed = prepared(name)
+    found = record["results"]
+    ((label, known),) = found["table"].items()
+    users = stored.demonstrations(domain.name, "lifelong").select(found["arrival"])
+    learned = comparison.restore(tensors, users, found["alpha"], known["pure"])
+    return found, known, label, learned, users, domain, seed
+
+
+@pytest.mark.parametrize("name", TRIALS)
+def test_a_sample_of_the_hundred_scores_again_as_recorded(name):
+    found, known, _, learned, users, *_ = lived(name)
+    assert learned.weights == pytest.approx(np.array(found["weights"]))
+    some = np.arange(0, users.n_demonstrations, 12)
+    mixtures = Mixtures(learned.policies.actor(), learned.weights[some])
+    found = demonstration_log_likelihood(mixtures, users.select(some)) / users.horizon
+    expected = np.array(known["log_likelihood_per_step"])[some]
+    assert found == pytest.approx(expected, abs=stored.LIKELIHOOD)
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("name", TRIALS)
+def test_the_hundred_score_again_as_recorded(name):
+    found, known, label, learned, users, domain, seed = lived(name)
+    assert_policies_score(learned.actor(), users, seed, known, label)
+    test = stored.rewards_test_set(domain.name)
+    task = learned.rewards.evaluate(test.observations, "task")[0].mean(1)
+    assert vars(reward_correlations(test, task)) == pytest.approx(
+        {k: found["looks"][-1][k] for k in ("pearson", "spearman", "spearman_of_good")},
+        abs=stored.CORRELATION,
+    )
+    everybody = people.stream_actor(stored.demonstrations(domain.name, "lifelong"))
+    acting = Mixtures(everybody.actor, everybody.weights[found["arrival"]])
+    ((k, means),) = means_on_takes(learned.rewards, acting, domain, seed, (3,)).items()
+    assert recognized(means, known["pure"]).sum() == known["recognized_fresh"][str(k)]

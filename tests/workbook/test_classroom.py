@@ -11,6 +11,7 @@ import test_exercises as exercises
 
 from dmsrd_lite.__main__ import main
 from dmsrd_lite.workbook import classroom
+from dmsrd_lite.workbook.records import ROOT
 
 LESSON = "04_policy_mixture"
 
@@ -84,6 +85,7 @@ def test_bad_input_is_one_sentence(course, tmp_path, capsys):
             "00_start_here",
         ): "00_start_here has no exercise; expected one of 01",
         ("release", tmp_path / "full"): "not empty and not a course",
+        ("release", ROOT / "class"): "inside of this repository; expected a folder outside",
         ("grade", course, tmp_path / "nobody"): "no notebook in it; expected STUDENT/LESSON.ipynb",
         ("report", tmp_path / "nowhere"): "no course; expected a folder made by",
     }.items():
@@ -117,6 +119,21 @@ def test_what_is_unusual_is_noticed(change, words, gradable, tmp_path):
     assert can == gradable
 
 
+def test_a_check_that_was_deleted_is_put_back_in_its_place(tmp_path):
+    whole = exercises.student_copy(LESSON)
+    hand_in(tmp_path, "out", whole)
+    names = [classroom.task_of(cell) for cell in whole.cells]
+    for missing in ("mix-check", "explain-check", "explain"):
+        copy = exercises.student_copy(LESSON)
+        copy.cells = [cell for cell in copy.cells if classroom.task_of(cell) != missing]
+        hand_in(tmp_path, "ada", copy)
+        places = (tmp_path / who / f"{LESSON}.ipynb" for who in ("ada", "out"))
+        notebook, gone = classroom.mended(*places)
+        assert gone == [missing]
+        found = [classroom.task_of(cell) for cell in notebook.cells if classroom.task_of(cell)]
+        assert found == [name for name in names if name and (name != missing or "check" in name)]
+
+
 @pytest.mark.verify
 def test_a_class_of_all_sorts(course, tmp_path):
     """Full points for the reference, none untouched; each mishap costs its own student, or its own task."""
@@ -142,6 +159,9 @@ def test_a_class_of_all_sorts(course, tmp_path):
     )
     hand_in(folder, "gil", noisy)
     hand_in(folder, "hal", solved(), "my homework.ipynb")
+    deleted = solved()
+    deleted.cells = [cell for cell in deleted.cells if classroom.task_of(cell) != "explain-check"]
+    hand_in(folder, "jan", deleted)
     shutil.copytree(folder / "ben", folder / "late" / "ben")
     hand_in(folder, "ida", solved("07_benchmark"), "07_benchmark.ipynb")
     table = pd.read_csv(classroom.grade(course, folder), keep_default_na=False).set_index("student")
@@ -149,18 +169,25 @@ def test_a_class_of_all_sorts(course, tmp_path):
     earned = {name: float(value) for name, value in table.points.items() if value != ""}
     assert earned == {
         "ada": full, "dora": full - points["mix"], "emil": full - points["explain"], "fay": full, "gil": full,
-        "ida": 12,
+        "ida": 12, "jan": full,
     }  # fmt: skip
     notes = {
         "ben": "handed in 2 times",
         "cleo": "does not open",
         "fay": "more than once",
         "hal": "is no exercise",
+        "jan": "missing: explain-check; checks were put back",
     }
     assert {name: note for name, note in table.note.items() if note}.keys() == notes.keys()
     assert all(words in table.note[name] for name, words in notes.items())
     pages = Counter(path.parts[-3] for path in (course / "feedback").rglob("*.html"))
-    assert pages == Counter(["ada", "dora", "emil", "fay", "gil", "ida"])
+    assert pages == Counter(["ada", "dora", "emil", "fay", "gil", "ida", "jan"])
+    for page in (course / "feedback").rglob("*.html"):
+        assert "HIDDEN TESTS" not in page.read_text()
     shutil.rmtree(folder / "late")
     table = pd.read_csv(classroom.grade(course, folder), keep_default_na=False).set_index("student")
     assert float(table.points["ben"]) == 0
+    other = tmp_path / "other"
+    hand_in(other, "kim", "this is no notebook")
+    table = pd.read_csv(classroom.grade(course, other), keep_default_na=False).set_index("student")
+    assert {"cleo", "kim"} <= set(table.index[table.note != ""]), "notes of other folders stay"

@@ -7,6 +7,7 @@ import resource
 import signal
 import socket
 import sys
+import textwrap
 import time
 from contextlib import contextmanager
 from dataclasses import replace
@@ -233,6 +234,13 @@ def test_shipped_plans_fit_their_notebooks():
     for path in (ROOT / "papermill_runs" / "plans").glob("*.toml"):
         plan = plans.load_plan(path)
         assert (plan.name, plan.runs != (), plan.minutes > 0) == (path.stem, True, True)
+
+
+def test_the_plan_that_is_explained_can_be_read(tmp_path):
+    text = (ROOT / "papermill_runs" / "README.md").read_text()
+    example = re.search(r"(?:^    .*\n|^\n)*^    name = (?:.*\n)(?:^    .*\n|^\n)*", text, re.M)[0]
+    (tmp_path / "plan.toml").write_text(textwrap.dedent(example))
+    assert len(plans.load_plan(tmp_path / "plan.toml").runs) == 6
 
 
 @pytest.mark.verify
