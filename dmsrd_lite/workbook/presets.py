@@ -405,7 +405,7 @@ def _lifelong(domain: str, quick: bool) -> LifelongLesson:
         return LifelongLesson(
             domain, 100, ours, printed, looks, (5, 25, 50, 100), _fresh(domain), (3, 10, 30)
         )
-    airl = AIRLSettings(n_iterations=1, episodes=4, cloning_steps=1500, coverage_episodes=1)
+    airl = AIRLSettings(n_iterations=1, episodes=4, cloning_steps=1000, coverage_episodes=1)
     ours = replace(ours, airl=airl, own_rollouts=5)
     printed = replace(printed, airl=replace(printed.airl, n_iterations=10))
     ours, printed = (
@@ -416,7 +416,7 @@ def _lifelong(domain: str, quick: bool) -> LifelongLesson:
         )
         for loop in (ours, printed)
     )
-    return LifelongLesson(domain, 6, ours, printed, (3, 6), (), _fresh(domain), (3, 10))
+    return LifelongLesson(domain, 6, ours, printed, (3, 6), (), _fresh(domain), (3, 10), n_looks=1)
 
 
 @dataclass(frozen=True)
