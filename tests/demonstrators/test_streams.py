@@ -23,6 +23,7 @@ EASY = replace(
 )
 
 
+@pytest.mark.verify
 def test_files_of_people_who_were_chosen_and_of_a_stream_of_them(tmp_path, monkeypatch):
     made = streams.generate_demonstrations(EASY, TINY, 0, tmp_path, n_kept=3)
     paths = [tmp_path / f"inverted_pendulum_{take}.npz" for take in ("demonstrations", "second_take")]
