@@ -26,10 +26,8 @@ class PendulumBatch:
 
         folder = os.path.join(os.path.dirname(gymnasium_mujoco.__file__), "assets")
         model = mujoco.MjModel.from_xml_path(os.path.join(folder, "inverted_pendulum.xml"))
-        needless = (
-            mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_ISLAND
-        )  # nothing collides
-        model.opt.disableflags |= int(needless)
+        bits = mujoco.mjtDisableBit
+        model.opt.disableflags |= int(bits.mjDSBL_CONTACT | bits.mjDSBL_ISLAND)  # nothing collides
         self._batch = Batch(model, n_environments, n_threads)
         self._position, self._velocity, self._control = (
             self._batch.bind(f) for f in ("qpos", "qvel", "ctrl")

@@ -80,7 +80,9 @@ def learn_stream(
     if state.records and _digests(state.shown) != digests[: len(state.records)]:
         raise InputError("a state that knows other demonstrations; expected those that were shown first")
     write_atomically(note, lambda file: file.write(made_with.encode()))
-    state = max([state, *_found(folder, "checkpoint_*", shown)], key=lambda known: len(known.records))
+    state = max(
+        [state, *_found(folder, "checkpoint_*", shown, digests)], key=lambda known: len(known.records)
+    )
     n, total = len(state.records), shown.n_demonstrations
     lines = [json.dumps(pair) + "\n" for pair in zip(digests[:n], state.records, strict=True)]
     write_atomically(journal, lambda file: file.write("".join(lines).encode()))  # without one in flight
@@ -97,13 +99,12 @@ def learn_stream(
 
 def kept_states(folder: str | Path, shown: DemonstrationSet) -> Iterator[State]:
     """The states that ``learn_stream`` kept in ``folder``, in order; ``shown``: its demonstrations."""
-    yield from _found(Path(folder).resolve(), "kept_*", shown)
+    yield from _found(Path(folder).resolve(), "kept_*", shown, _digests(shown))
 
 
-def _found(folder: Path, pattern: str, shown: DemonstrationSet) -> Iterator[State]:
+def _found(folder: Path, pattern: str, shown: DemonstrationSet, digests: list[str]) -> Iterator[State]:
     """What the files hold, with its demonstrations and records; a warning for each that cannot be used."""
     records: list[dict] = []
-    digests = _digests(shown)
     for line in (folder / _JOURNAL).read_text().splitlines() if (folder / _JOURNAL).exists() else ():
         try:
             digest, record = json.loads(line)

@@ -142,29 +142,25 @@ def test_killed_at_random_moments_a_stream_ends_with_the_same_bits(tmp_path):
     assert_same(newest(tmp_path / "killed"), bare(whole))
 
 
-def test_a_spoiled_checkpoint_costs_one_demonstration(three, states, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "n_bytes", "sentence"),
+    [
+        ("checkpoint_1.safetensors", 100, "cannot be read .*"),
+        ("records.jsonl", 20, "knows 3 demonstrations; expected 3 lines in records.jsonl"),
+    ],
+)
+def test_what_was_cut_short_costs_one_demonstration(name, n_bytes, sentence, three, states, tmp_path):
     keep(tmp_path, states[2], states[3])
-    last = tmp_path / "checkpoint_1.safetensors"
-    last.write_bytes(last.read_bytes()[:-100])
-    sentence = r"1\.safetensors: cannot be read .*; going on from the checkpoint before it$"
-    with pytest.warns(UserWarning, match=sentence):
+    spoiled = tmp_path / name
+    spoiled.write_bytes(spoiled.read_bytes()[:-n_bytes])
+    whole = rf"1\.safetensors: {sentence}; going on from the checkpoint before it$"
+    with pytest.warns(UserWarning, match=whole):
         found = list(learn_stream(State(PENDULUM, 0), three, TINY, tmp_path))
     for state, known in zip(found, states[2:], strict=True):
         assert_same(state, known)
         assert state.records[:2] == states[2].records
-    assert_same(load_state(last, PENDULUM), bare(states[3]))
-
-
-def test_a_journal_cut_short_costs_one_demonstration(three, states, tmp_path):
-    keep(tmp_path, states[2], states[3])
-    journal = tmp_path / "records.jsonl"
-    journal.write_text(journal.read_text()[:-20])
-    sentence = r"1\.safetensors: knows 3 demonstrations; expected 3 lines in records.jsonl; going on"
-    with pytest.warns(UserWarning, match=sentence):
-        first, last = learn_stream(State(PENDULUM, 0), three, TINY, tmp_path)
-    assert_same(first, states[2])
-    assert_same(last, states[3])
-    assert len(journal.read_text().splitlines()) == 3
+    assert_same(load_state(tmp_path / "checkpoint_1.safetensors", PENDULUM), bare(states[3]))
+    assert len((tmp_path / "records.jsonl").read_text().splitlines()) == 3
 
 
 def test_states_that_are_kept_hold_all_that_was_known(three, states, tmp_path):
