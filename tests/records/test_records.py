@@ -98,7 +98,7 @@ def test_recorded_rewards_correlate_again_as_recorded(name):
 @pytest.mark.verify
 @pytest.mark.parametrize("name", FROM_NOTHING + FORMS)
 def test_fresh_policies_learn_again_as_recorded(name):
-    """The whole training takes minutes; its first iterations, which depend on the reward, come back."""
+    """The whole training takes minutes; its first update, which depends on the reward, comes back."""
     record, _, domain, seed = prepared(name)
     lesson, part = "_".join(name.split("_")[:2]), "g" if name[:2] == "02" else "task"
     fresh = presets.choose(lesson, domain.name, "full").fresh
@@ -111,9 +111,9 @@ def test_fresh_policies_learn_again_as_recorded(name):
             def paid(data, _seed, rewards=rewards):
                 return rewards.evaluate(data.observations[:, :, 1:], part)[0]
 
-            steps = islice(train_policies(domain, paid, fresh, seed + 100), 3)
+            steps = islice(train_policies(domain, paid, fresh, seed + 100), 2)
             again = [r["environment_return"] / r["horizon"] for r in steps]
-            assert again == pytest.approx(np.array(known["curves"][:3]), abs=stored.FIRST_STEPS), label
+            assert again == pytest.approx(np.array(known["curves"][:2]), abs=stored.FIRST_STEPS), label
 
 
 @pytest.mark.verify
