@@ -113,7 +113,8 @@ def test_fresh_policies_learn_again_as_recorded(name):
 
             steps = islice(train_policies(domain, paid, fresh, seed + 100), 2)
             again = [r["environment_return"] / r["horizon"] for r in steps]
-            assert again == pytest.approx(np.array(known["curves"][:2]), abs=stored.FIRST_STEPS), label
+            moved = np.median(np.abs(np.array(again) - known["curves"][:2]), axis=1)
+            assert (moved < stored.FIRST_UPDATE[domain.name]).all(), (label, moved)
 
 
 @pytest.mark.verify
