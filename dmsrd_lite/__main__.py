@@ -46,6 +46,9 @@ def _convert(arguments: argparse.Namespace) -> int:
     from dmsrd_lite.demonstrations import save_demonstrations
 
     domain = get_domain(arguments.domain) if arguments.domain else None
+    target, source = Path(arguments.file).resolve(), Path(arguments.source).resolve()
+    if target.suffix != ".npz" or target == source:
+        raise InputError(f"{target}: is what is to be written; expected another file, with the ending .npz")
     found, notes = convert(arguments.source, domain, arguments.each, arguments.steps)
     path = save_demonstrations(arguments.file, found)
     n, k, t = found.actions.shape[:3]
@@ -146,7 +149,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _whole(name: str, least: int) -> Callable[[str], int]:
-    return partial(check_whole, name=name, least=least)
+    def check(value: str) -> int:
+        try:
+            return check_whole(value, name, least)
+        except InputError as error:  # argparse would say only that it is invalid
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return check
 
 
 def _add_data(command: _Adds) -> None:

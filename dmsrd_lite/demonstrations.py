@@ -147,9 +147,7 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
             raise ValueError("bytes instead of an array")
     except (ValueError, OSError, EOFError, MemoryError, NotImplementedError, RuntimeError,
             zipfile.BadZipFile, zlib.error):  # fmt: skip
-        return {}, [
-            "cannot be read (cut, pickled or no .npz file); expected a file written by save_demonstrations"
-        ]
+        return {}, ["cannot be read (cut, pickled or no .npz file); expected an .npz file with named arrays"]
     return arrays, faults
 
 

@@ -37,6 +37,9 @@ def convert(
     """
     path = Path(source).resolve()
     episodes, together = _episodes(path)
+    if together and each not in (1, together):
+        text = f"has four axes, {together} episodes for each person"
+        raise InputError(f"{path}: {text}; expected --each {together}, or none")
     each = together or each
     if len(episodes) % each:
         raise InputError(
@@ -56,8 +59,8 @@ def convert(
     states = [e.observations for e in episodes]
     kept["observations"] = _stack(states, each, steps + 1 if steps else 0)
     notes = []
-    if any(some.dtype == np.float32 for some in states):
-        notes.append("observations are float32: states that differ by less than a millionth look the same")
+    if any(some.dtype.itemsize < 8 for some in states):
+        notes.append("observations are of single precision or less: states nearer than that look the same")
     if "rewards" not in kept:
         notes.append("there are no rewards: returns are unknown, and nothing that learns needs them")
     if each == 1:
@@ -92,14 +95,23 @@ def _fault(episode: Episode, domain: Domain, steps: int, n_states: int) -> str:
         return "has no actions; expected the executed action of every step"
     t = len(actions)
     if states.ndim != 2 or len(states) not in (t, t + 1) or states.shape[1] != domain.obs_dim:
-        return f"has observations of shape {states.shape}; expected ({t} or {t + 1}, {domain.obs_dim})"
+        wanted = f"({t} or {t + 1}, {domain.obs_dim}) of {domain.name}"
+        return f"has observations of shape {states.shape}; expected {wanted}"
     if actions.shape != (t, domain.action_dim):
-        return f"has actions of shape {actions.shape}; expected ({t}, {domain.action_dim})"
+        wanted = f"({t}, {domain.action_dim}) of {domain.name}"
+        return f"has actions of shape {actions.shape}; expected {wanted}"
+    for name, part in (("observations", states), ("actions", actions)):
+        if fault := _no_number(part[: steps + 1] if steps else part, name):
+            return fault
     if steps:
-        return f"has {t} steps; expected at least {steps}" if t < steps or len(states) <= steps else ""
+        short = t < steps or len(states) <= steps
+        found = f"has {t} steps and {len(states)} states"
+        return f"{found}; expected at least {steps} and {steps + 1}, or a smaller --steps" if short else ""
     if episode.over:
         go_on = "expected a task that goes on for a fixed time, or --steps to cut all episodes"
         return f"ended early, after {t} steps; {go_on}"
+    if t > domain.horizon:
+        return f"has {t} steps; expected at most {domain.horizon}, or --steps {domain.horizon} to cut them"
     if len(states) != n_states:
         return (
             f"has {len(states)} states, the first has {n_states}; expected equally long episodes, or --steps"
@@ -107,8 +119,20 @@ def _fault(episode: Episode, domain: Domain, steps: int, n_states: int) -> str:
     return ""
 
 
+def _no_number(array: np.ndarray, name: str) -> str:
+    """What is no finite number in an episode's array (steps, dimension), and where."""
+    if array.dtype.kind not in "fiub":
+        return f"{name}: has type {array.dtype}; expected numbers"
+    wrong = np.argwhere(~np.isfinite(array))
+    where = f"step {wrong[0][0]}, coordinate {wrong[0][1]}" if len(wrong) else ""
+    return f"{name}: holds NaN or infinity, first at {where}; expected finite numbers" if where else ""
+
+
 def _episodes(path: Path) -> tuple[list[Episode], int]:
     """What the file or folder holds, and how many in a row are one person's (0: it does not say)."""
+    kinds = "an .npz file, a Minari dataset, or trajectories saved by imitation"
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file or folder; expected {kinds}")
     if path.suffix == ".npz":
         return _from_arrays(path)
     if (path / "state.json").is_file():
@@ -119,7 +143,6 @@ def _episodes(path: Path) -> tuple[list[Episode], int]:
             names = ", ".join(str(folder.parent.relative_to(path)) for folder in folders)
             raise InputError(f"{path}: holds {len(folders)} datasets ({names}); expected the folder of one")
         if not folders:
-            kinds = "an .npz file, a Minari dataset, or trajectories saved by imitation"
             raise InputError(f"{path}: holds no demonstrations that we can read; expected {kinds}")
         found = _from_minari(folders[0])
     if not found:
@@ -134,15 +157,19 @@ def _from_arrays(path: Path) -> tuple[list[Episode], int]:
         raise InputError(f"{path}: {faults[0]}")
     states, expected = arrays.get("observations"), "expected (episodes, steps, dimension)"
     if states is None or states.ndim not in (3, 4) or not states.size:
-        shape = "is missing" if states is None else f"has shape {states.shape}"
+        held = ", ".join(arrays) or "nothing"
+        shape = f"is missing (the file holds {held})" if states is None else f"has shape {states.shape}"
         raise InputError(f"{path}: observations: {shape}; {expected}, or one axis more in front for persons")
     lead = states.shape[:-2]
     for name, n_axes in (("actions", len(lead) + 2), ("rewards", len(lead) + 1), ("reset_seeds", len(lead))):
         if name in arrays and (arrays[name].shape[: len(lead)] != lead or arrays[name].ndim != n_axes):
-            raise InputError(f"{path}: {name}: has shape {arrays[name].shape}; expected {(*lead, '...')}")
+            wanted = ", ".join([*map(str, lead), "steps", "dimension"][:n_axes])
+            raise InputError(f"{path}: {name}: has shape {arrays[name].shape}; expected ({wanted})")
     n, names = int(np.prod(lead)), ("observations", "actions", "rewards", "reset_seeds")
     flat = [arrays[k].reshape(n, *arrays[k].shape[len(lead) :]) if k in arrays else [None] * n for k in names]
-    return [Episode(*parts) for parts in zip(*flat, strict=True)], lead[1] if len(lead) == 2 else 0
+    ended = np.atleast_1d(arrays.get("terminations", np.zeros(n)).reshape(n, -1).any(1))
+    parts = zip(*flat, ended, strict=True)
+    return [Episode(*part) for part in parts], lead[1] if len(lead) == 2 else 0
 
 
 def _from_minari(folder: Path) -> list[Episode]:

@@ -86,7 +86,6 @@ def learn(state: State, demonstrations: DemonstrationSet, settings: DMSRDSetting
     A state is replaced, never changed: an error leaves the last one as it was, and any of them can be gone on
     from.
     """
-    _check(state, demonstrations, settings)
     for i in range(demonstrations.n_demonstrations):
         state = learn_one(state, demonstrations.select([i]), settings)
         yield state
@@ -94,6 +93,7 @@ def learn(state: State, demonstrations: DemonstrationSet, settings: DMSRDSetting
 
 def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> State:
     """Algorithm 1, lines 2 to 17, for one demonstration tau_i; the numbers are the paper's lines."""
+    _check(state, new, settings)
     s, started, n = settings, time.perf_counter(), len(state.weights)
     state, seed = replace(state, alpha=s.msrd.alpha, form=s.form), [state.seed, 102, n]
     steps = {"search": 0, "airl": 0}

@@ -30,7 +30,7 @@ def reference_divergence(
 
     The divergence of the demonstration's trajectories from each other; the domain's own guess for a single
     one. With ``matched_starts``, where these differ as much as strategies do, that of its clone's rollouts
-    from the same starts.
+    from the same starts, as many as a mixture is measured with.
     """
     comparison = new.domain.comparison
     if not comparison.matched_starts:
@@ -38,4 +38,4 @@ def reference_divergence(
         return own if np.isfinite(own) else comparison.own_at_most
     clone = candidate().clone or AIRL(new, replace(settings.airl, start="clone"), seed).clone
     assert clone is not None
-    return float(policy_divergences(clone, new, seed)[0])
+    return float(policy_divergences(clone, new, seed, n_rollouts=settings.mixture.final_rollouts)[0])

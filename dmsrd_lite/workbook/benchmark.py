@@ -181,9 +181,10 @@ def as_published(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
 
 
 def ranking(found: Benchmark, entries: Sequence[Entry], metric: str) -> str:
-    """Methods by their mean, the largest first."""
+    """Methods and their means, the best first: the least KL, the most of everything else."""
     mean = {entry[0]: found.values(*entry, metric).mean() for entry in entries}
-    return " > ".join(sorted(mean, key=lambda method: -mean[method]))
+    sign = 1 if metric == "divergence" else -1
+    return ", ".join(f"{method} {mean[method]:.2f}" for method in sorted(mean, key=lambda m: sign * mean[m]))
 
 
 def rescued(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:

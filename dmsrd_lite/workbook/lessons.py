@@ -53,8 +53,8 @@ class Lesson:
 
         seconds = time.perf_counter() - self.started
         results = plain({**results, "environment_steps": environment_steps, "seconds": seconds})
-        text = f"{self.name}: {environment_steps:,} environment steps, {seconds:.0f} s; {', '.join(results)}"
-        publish_display_data({MIME: results, "text/plain": textwrap.shorten(text, 88, placeholder=" ...")})
+        text = f"{self.name}: {environment_steps:,} environment steps, {seconds:.0f} s"
+        publish_display_data({MIME: results, "text/plain": text})
 
 
 def start(
@@ -93,15 +93,17 @@ def slider(draw: Callable[..., Any], **controls: Any) -> None:
     """Sliders over ``draw``, which returns a figure or a text; its defaults are shown first.
 
     The figure is an output of its own: a notebook that is read without a kernel, or executed headless, keeps
-    the last one. ``controls`` as in ipywidgets: ``(least, most, step)``, or a list of values.
+    the last one. ``controls`` as in ipywidgets: ``(least, most, step)``, a list of values, or a widget.
     """
     import matplotlib.pyplot as plt
     from IPython.display import display
     from ipywidgets import HBox, interactive
 
-    defaults = {name: p.default for name, p in inspect.signature(draw).parameters.items()}
+    parameters = inspect.signature(draw).parameters.items()
+    defaults = {name: p.default for name, p in parameters if p.kind is not p.VAR_KEYWORD}
     widgets = {
-        name: interactive.widget_from_abbrev(control, defaults[name]) for name, control in controls.items()
+        name: interactive.widget_from_abbrev(control, defaults.get(name))
+        for name, control in controls.items()
     }
 
     class Sliders(HBox):

@@ -51,7 +51,11 @@ TEST_SETS = {name: _for_test_sets(usual) for name, usual in DEMONSTRATORS.items(
 
 # The search for a mixture (Equation 3): candidates, then refinements around the best of them.
 MIXTURE = {PENDULUM: MixtureSettings(64, 32), LANDER: MixtureSettings(64, 32)}
-_OURS = {name: replace(usual, from_actions=True) for name, usual in MIXTURE.items()}  # the likeliest first
+# The likeliest first. Lander: with 10 rollouts KL shakes by a nat, and eps takes news for noise (lesson 06).
+_OURS = {
+    PENDULUM: replace(MIXTURE[PENDULUM], from_actions=True),
+    LANDER: replace(MIXTURE[LANDER], from_actions=True, final_rollouts=30),
+}
 QUICK_MIXTURE = MixtureSettings(24, 16, n_finalists=5)
 
 _DRIFT = ((1.0, 0.5), (1.0, 1.0), (1.0, 2.0))  # rollouts of the untrained policy that lean to one side
@@ -104,7 +108,7 @@ METHODS = {
     LANDER: MethodSettings(
         msrd=MSRDSettings(n_iterations=25, discriminator_steps=10),
         batch=AIRLSettings(n_iterations=25, discriminator_steps=10),
-        dmsrd=DMSRDSettings(kl_margin=1.0, msrd=_LANDER_ROUND, mixture=_OURS[LANDER]),
+        dmsrd=DMSRDSettings(kl_margin=1.5, msrd=_LANDER_ROUND, mixture=_OURS[LANDER]),
     ),
 }
 _DMSRD_FROM_NOTHING = {PENDULUM: 130, LANDER: 110}  # iterations of AIRL on a new strategy
@@ -273,7 +277,7 @@ class DMSRDLesson:  # 06
     n_fresh: tuple[int, ...] = (3, 10, 30)  # fresh takes on which recognition is measured
     n_known: int = 5  # the rule for eps: so many are known ...
     n_decisions: int = 20  # ... and so many people of a new kind, and as many mixtures, arrive
-    margins: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # eps above its reference (nats)
+    margins: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0, 4.0)  # eps above its reference (nats)
 
     @property
     def forms(self) -> dict[str, DMSRDSettings]:
@@ -388,7 +392,7 @@ class LifelongLesson:  # 08
 
 
 def _lifelong(domain: str, quick: bool) -> LifelongLesson:
-    margin = {PENDULUM: 1.0, LANDER: 2.5}[domain]
+    margin = {PENDULUM: 1.0, LANDER: 3.0}[domain]  # mixtures stay below 2, pilots of the five above 5
     usual = METHODS[domain].dmsrd
     ours = replace(
         usual,

@@ -22,6 +22,12 @@ def arrays():
     return {"observations": states, "actions": actions, "rewards": rng.normal(size=(N, T))}
 
 
+def spoiled():
+    states = np.zeros((N, T + 1, 4))
+    states[2, 3, 1] = np.nan
+    return states
+
+
 def plain(folder, arrays, **changes):
     np.savez(folder / "plain.npz", **{k: v for k, v in {**arrays, **changes}.items() if v is not None})
     return folder / "plain.npz"
@@ -69,12 +75,16 @@ def test_a_file_with_four_axes_says_who_is_who(arrays, tmp_path):
     found, _ = convert(plain(tmp_path, people, reset_seeds=np.array([[5, 6], [7, 8]])))
     assert found.actions.shape == (2, 2, T, 1)
     assert found.reset_seeds.tolist() == [[5, 6], [7, 8]]
+    with pytest.raises(InputError, match="2 episodes for each person; expected --each 2, or none"):
+        convert(tmp_path / "plain.npz", each=4)
 
 
 def test_notes(arrays, tmp_path):
     single = arrays["observations"].astype(np.float32)
     _, notes = convert(plain(tmp_path, arrays, observations=single, rewards=None))
-    for text, note in zip(("float32", "no rewards", "one trajectory per person"), notes, strict=True):
+    for text, note in zip(
+        ("single precision", "no rewards", "one trajectory per person"), notes, strict=True
+    ):
         assert text in note
 
 
@@ -82,14 +92,19 @@ def test_notes(arrays, tmp_path):
     ("changes", "options", "sentence"),
     [
         ({"actions": None}, {}, "episode 0: has no actions; expected"),
-        ({"observations": None}, {}, "observations: is missing; expected"),
+        ({"observations": None}, {}, "observations: is missing (the file holds actions, rewards); expected"),
         ({"observations": np.zeros((N, T + 1, 5))}, {}, "5 observations and 1 actions a step"),
         ({"observations": np.zeros((N, T + 3, 4))}, {}, "shape (15, 4); expected (12 or 13, 4)"),
-        ({"actions": np.zeros((3, T, 1))}, {}, "actions: has shape (3, 12, 1); expected (4, '...')"),
+        ({"actions": np.zeros((3, T, 1))}, {}, "has shape (3, 12, 1); expected (4, steps, dimension)"),
         ({"actions": np.array([None, [1]], dtype=object)}, {}, "unequal length"),
         ({}, {"each": 3}, "holds 4 episodes; expected a multiple of 3"),
-        ({}, {"steps": 13}, "has 12 steps; expected at least 13"),
-        ({}, {"domain": get_domain("lunar_lander")}, "expected (12 or 13, 8)"),
+        ({}, {"steps": 13}, "has 12 steps and 13 states; expected at least 13 and 14, or a smaller --steps"),
+        ({}, {"domain": get_domain("lunar_lander")}, "expected (12 or 13, 8) of lunar_lander"),
+        ({"observations": spoiled()}, {}, "episode 2: observations: holds NaN or infinity, first at step 3"),
+        ({"observations": np.full((N, T + 1, 4), "x")}, {}, "observations: has type <U1; expected numbers"),
+        ({"terminations": np.eye(N, T)}, {}, "episode 0: ended early, after 12 steps; expected"),
+        ({"observations": np.zeros((N, 1200, 4)), "actions": np.zeros((N, 1200, 1)), "rewards": None}, {},
+         "has 1200 steps; expected at most 1000, or --steps 1000 to cut them"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_used_is_said_in_a_sentence(changes, options, sentence, arrays, tmp_path):
@@ -115,9 +130,21 @@ def test_what_a_dataset_may_be_refused_for(arrays, tmp_path, monkeypatch):
     assert convert(two / "pole" / "people-v1")[0].n_demonstrations == N
 
 
+@pytest.mark.parametrize("target", ["mine.safetensors", "plain.npz"])
+def test_a_file_of_another_kind_or_the_source_itself_is_not_written(target, arrays, tmp_path, capsys):
+    source = plain(tmp_path, arrays)
+    before = source.read_bytes()
+    assert main(["convert", str(source), str(tmp_path / target)]) == 2
+    assert "expected another file, with the ending .npz" in capsys.readouterr().err
+    assert source.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["plain.npz"]
+
+
 def test_folders_that_hold_nothing_or_are_cut(tmp_path):
     with pytest.raises(InputError, match="holds no demonstrations that we can read; expected"):
         convert(tmp_path)
+    with pytest.raises(InputError, match="nowhere: there is no such file or folder; expected an"):
+        convert(tmp_path / "nowhere")
     for file in SAVED.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes()[:900])
     with pytest.raises(InputError, match=r"cannot be read \(\w+\); expected trajectories with obs and acts"):

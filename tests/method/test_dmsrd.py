@@ -165,7 +165,8 @@ def test_on_the_lander_the_clone_calibrates_the_threshold(lander_set, warm, monk
     (record,) = after(State(lander, 0), first, replace(TINY, kl_threshold=0.0, **parts)).records
     assert len(made) == 1, "the clone that AIRL starts from is the one that calibrates"
     clone = made[-1]["learner"].clone
-    assert record["reference"] == divergence.policy_divergences(clone, first, [0, 102, 0, 7])[0]
+    as_many = {"n_rollouts": TINY.mixture.final_rollouts}
+    assert record["reference"] == divergence.policy_divergences(clone, first, [0, 102, 0, 7], **as_many)[0]
     assert record["threshold"] == record["reference"] + TINY.kl_margin
 
 

@@ -76,8 +76,7 @@ def test_what_is_handed_over_is_one_line_for_a_reader(monkeypatch):
     results = {f"a_long_name_{k}": np.arange(1000.0) for k in range(9)} | {"nothing": np.nan}
     begin().hand_over(environment_steps=1234567, **results)
     (data,) = published
-    assert data["text/plain"].startswith("03_msrd: 1,234,567 environment steps, 0 s; a_long_name_0")
-    assert len(data["text/plain"]) <= 88
+    assert data["text/plain"] == "03_msrd: 1,234,567 environment steps, 0 s"
     assert data[MIME].keys() == {*results, "environment_steps", "seconds"}
     assert (data[MIME]["a_long_name_8"], data[MIME]["nothing"]) == (list(range(1000)), None)
     json.dumps(data, allow_nan=False)
