@@ -139,7 +139,8 @@ class AIRL:
     ask for them), ``policies`` and ``rewards`` (the last iterates), ``clone`` (Actor of behavioural cloning),
     ``steps`` per strategy so far.
     ``networks``: those of an earlier learner (``networks()``) instead of a clone to start from. ``shared``:
-    the rewards of an earlier learner, whose task reward is added to what is learned here, frozen.
+    the rewards of an earlier learner, whose task reward is added to what is learned here, frozen; with
+    ``task_learns`` a copy of it learns, too, as in MSRD.
     """
 
     alpha = 0.0  # weight of the strategy rewards beside a shared task reward; 0: no task reward
@@ -153,6 +154,7 @@ class AIRL:
         *,
         networks: dict[str, torch.Tensor] | None = None,
         shared: Rewards | None = None,
+        task_learns: bool = False,
     ):
         self.domain, self.settings = demonstrations.domain, settings
         self.seed = seed = extend(
@@ -176,7 +178,8 @@ class AIRL:
         if shared is not None:
             for rewards in (self.rewards, self.averaged_rewards):
                 rewards.task_reward.load_state_dict(shared.task_reward.state_dict())
-                rewards.task_reward.requires_grad_(False)
+                rewards.task_reward.requires_grad_(task_learns)
+        self.task_learns = task_learns
         self.replay: deque[Samples] = deque(maxlen=settings.replay_iterations or None)
         self.coverage: list[Samples] = []
         self.anchors: list[Samples] = []  # of an earlier learner's replay: what it saw on the way
@@ -404,8 +407,15 @@ class AIRL:
         return loss.detach().numpy().copy(), accuracy.numpy()
 
     def regularizer(self, x_samples: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-        """What a subclass adds to a step's loss; ``x_samples`` (M, n, obs_dim): reached by the policies."""
-        return torch.zeros(())
+        """What is added to a step's loss; ``x_samples`` (M, n, obs_dim): reached by the policies.
+
+        ``alpha sum_j E|g_j|`` where a task reward learns: what is common belongs there. A subclass adds more.
+        """
+        return (
+            self.alpha * self.rewards.g(x_samples).abs().mean(1).sum()
+            if self.task_learns
+            else torch.zeros(())
+        )
 
     def gradient_penalty(
         self, shown: torch.Tensor, samples: torch.Tensor, rng: np.random.Generator

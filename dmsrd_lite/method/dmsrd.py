@@ -15,14 +15,14 @@ from dmsrd_lite.method.divergence import policy_divergences
 from dmsrd_lite.method.kl_threshold import calibrate_threshold
 from dmsrd_lite.method.msrd import MSRDSettings
 from dmsrd_lite.method.policy_mixture import MixtureSettings, search_mixture
-from dmsrd_lite.method.rewards import Rewards, reward_as_task
+from dmsrd_lite.method.rewards import Rewards
 from dmsrd_lite.method.rounds import play_round
 from dmsrd_lite.method.state import State
 
 MIXTURE, BETTER_MIXTURE, NEW_STRATEGY = "mixture", "mixture, better than a new strategy", "new strategy"
 
 AS_PRINTED: dict[str, Any] = {
-    "add_task_reward": False, "task_from_first": False, "between_class": "mixtures", "own_rollouts": 0,
+    "add_task_reward": False, "task_learns": False, "between_class": "mixtures", "own_rollouts": 0,
     "search_again": False, "policies_after_new": True, "policies_after_mixture": True,
     "from_actions": False,
 }  # fmt: skip
@@ -35,7 +35,9 @@ class DMSRDSettings:
     )
     kl_margin: float = 0.5  # nats above the reference (``kl_threshold.reference_divergence``)
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
-    task_from_first: bool = False  # R_Task starts as the first person's reward (the paper: as nothing)
+    task_learns: bool = (
+        False  # R_Task learns beside a new strategy, and goes 1/M of the way (the paper: rests)
+    )
     between_class: str = "always"  # Equation 4 after every branch, after "mixtures" only (the paper), "never"
     own_rollouts: int = 20  # it is asked on so many of each person's explanation from new starts; 0: on what
     # was shown (the paper)
@@ -117,10 +119,8 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
             branch, known = BETTER_MIXTURE, state.explained(new, fit.weights)  # 12: keep w, no new strategy
         else:  # 14
             branch = NEW_STRATEGY
-            networks = candidate().networks()
-            if s.task_from_first and not state.n_strategies:
-                networks = reward_as_task(networks, state.alpha)
-            known = state.with_strategy(new, networks)  # 15, 16: w = e_M+1, M = M + 1, m_M = i
+            share = 1 / (state.n_strategies + 1) if s.task_learns else 0.0
+            known = state.with_strategy(new, candidate().networks(), share)  # 15, 16: w = e_M+1, m_M+1 = i
     decision = {"demonstration": n, "branch": branch, "kl_mix": kl_mix, "kl_new": kl_new, "threshold": eps}
     decision |= {"reference": reference, "weights": known.weights[n], "n_strategies": known.n_strategies}
     created = branch == NEW_STRATEGY
@@ -135,7 +135,7 @@ def _candidate(state: State, new: DemonstrationSet, settings: DMSRDSettings, see
     s = settings
     nothing = Rewards(state.domain, 1, s.airl.discount, seed, s.msrd.alpha)  # its R_Task is zero
     shared = state.rewards() if state.networks and s.add_task_reward else nothing
-    return AIRL(new, s.airl, seed, shared=shared)
+    return AIRL(new, s.airl, seed, shared=shared, task_learns=s.task_learns)
 
 
 def _check(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> None:

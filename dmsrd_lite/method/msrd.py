@@ -57,7 +57,7 @@ class MSRD(AIRL):
         if not settings.alpha > 0:
             raise InputError(f"alpha {settings.alpha!r}: expected a positive weight of the strategy rewards")
         self.alpha, self.between = settings.alpha, None
-        super().__init__(demonstrations, settings, seed, networks=networks)
+        super().__init__(demonstrations, settings, seed, networks=networks, task_learns=True)
         if between is not None:
             states, weights, pure = between
             x = to_tensor(self.domain.network_input(states))
@@ -65,7 +65,7 @@ class MSRD(AIRL):
 
     def regularizer(self, x_samples: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
         """``alpha sum_j E|R_S-j|`` on the policies' states, and Equation 4 where there are weights."""
-        loss = self.alpha * self.rewards.g(x_samples).abs().mean(1).sum()
+        loss = super().regularizer(x_samples, rng)
         if self.between is not None:
             x, weights, pure = self.between
             some = torch.from_numpy(rng.integers(0, x.shape[1], self.settings.between_class_batch))

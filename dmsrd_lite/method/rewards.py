@@ -68,20 +68,6 @@ class Rewards(torch.nn.Module):
         return _mean_over_telling(self, demonstrations)
 
 
-def reward_as_task(networks: dict[str, torch.Tensor], alpha: float) -> dict[str, torch.Tensor]:
-    """``AIRL.networks`` of one strategy with its reward moved to the task: ``R_Task <- alpha g``, ``g <- 0``.
-
-    R_1 stays what it was, to within the bound. The best guess of what people share is what the first wants.
-    """
-    moved = dict(networks)
-    for name, values in networks.items():
-        if ".strategy_reward." in name:
-            last = values.shape[-1] == 1
-            moved[name.replace("strategy_reward", "task_reward")] = alpha * values if last else values.clone()
-            moved[name] = torch.zeros_like(values) if last else values
-    return moved
-
-
 class MeanRewards(torch.nn.Module):
     """The mean of several reward functions, not of their weights: what teaches fresh policies (lesson 02)."""
 

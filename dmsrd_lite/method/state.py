@@ -77,15 +77,22 @@ class State:
         known = new if self.demonstrations is None else self.demonstrations.joined(new)
         return replace(self, demonstrations=known, weights=np.vstack([self.weights, weights]))
 
-    def with_strategy(self, new: DemonstrationSet, networks: dict[str, torch.Tensor]) -> "State":
+    def with_strategy(
+        self, new: DemonstrationSet, networks: dict[str, torch.Tensor], task_share: float = 0.0
+    ) -> "State":
         """With one more demonstration that is a strategy of its own: weights ``e_M+1``, its networks behind
         the others.
 
-        The task reward is shared; it stays as it was, or comes with the first strategy.
+        The task reward is shared; it comes with the first strategy, and goes ``task_share`` of the way to the
+        newcomer's later (its weights do).
         """
         m, old = self.n_strategies, self.networks
         joined = {
-            k: v if not old else old[k] if ".task_reward." in k else torch.cat([old[k], v])
+            k: v
+            if not old
+            else torch.lerp(old[k], v, task_share)
+            if ".task_reward." in k
+            else torch.cat([old[k], v])
             for k, v in networks.items()
         }
         wider = np.pad(self.weights, ((0, 0), (0, 1)))

@@ -13,7 +13,6 @@ from tiny import GENEROUS, PENDULUM, ROUGH, TINY, after, assert_same, copied, ev
 
 from dmsrd_lite.domains import LUNAR_LANDER, InputError
 from dmsrd_lite.method import airl, divergence, dmsrd, kl_threshold, rounds
-from dmsrd_lite.method.rewards import reward_as_task
 from dmsrd_lite.method.state import State
 
 WITHOUT_COVERAGE = {name: replace(getattr(ROUGH, name), coverage="none") for name in ("airl", "msrd")}
@@ -216,24 +215,27 @@ def test_as_printed_takes_every_deviation_back():
     assert (printed.between_class, printed.own_rollouts, printed.remembered) == ("mixtures", 0, 0)
     assert printed.policies_after_new
     assert printed.policies_after_mixture
-    off = printed.add_task_reward, printed.task_from_first, printed.search_again, printed.mixture.from_actions
+    off = printed.add_task_reward, printed.task_learns, printed.search_again, printed.mixture.from_actions
     assert off == (False, False, False, False)
     assert not printed.msrd.between_class_relative
     assert printed.airl == TINY.airl
 
 
-def test_the_task_reward_starts_as_the_first_persons_reward(three, monkeypatch):
-    """R_1 is what AIRL learned, all of it in R_Task; as printed R_Task is nothing yet."""
-    printed = after(State(PENDULUM, 0), three.select([0]), TINY.as_printed())
-    made = watch(monkeypatch, dmsrd, "AIRL")
-    state = after(State(PENDULUM, 0), three.select([0]), replace(TINY, task_from_first=True))
-    assert same(state.networks, reward_as_task(made[0]["learner"].networks(), TINY.msrd.alpha))
-    seen, first = three.observations, state.rewards()
-    assert np.abs(first.evaluate(seen, "task")).min() > 0
-    assert np.abs(first.evaluate(seen, "g")).max() == 0
-    assert np.abs(printed.rewards().evaluate(seen, "task")).max() == 0
-    total = (one.evaluate(seen, "total") for one in (first, printed.rewards()))
-    np.testing.assert_allclose(*total, atol=1e-3)
+def test_the_task_reward_learns_with_a_new_strategy_and_goes_its_share_of_the_way(three, monkeypatch):
+    """By hand: the first candidate's R_Task whole, half of the way to the second's; as printed it rests."""
+    learning, made = replace(TINY, task_learns=True), watch(monkeypatch, dmsrd, "AIRL")
+    monkeypatch.setattr(dmsrd, "play_round", lambda state, *_: (state, {}, {"search": 0}))
+    for settings in (learning, TINY.as_printed()):
+        made.clear()
+        state = after(State(PENDULUM, 0), three.select([0, 1]), replace(settings, kl_threshold=1e-9))
+        assert state.n_strategies == 2
+        first, second = (one["learner"].networks() for one in made)
+        names = [name for name in state.networks if ".task_reward." in name]
+        for name in names:
+            expected = (first[name] + second[name]) / 2 if settings is learning else first[name]
+            torch.testing.assert_close(state.networks[name], expected)
+        moved = [not torch.equal(first[name], second[name]) for name in names]
+        assert any(moved), "or half of the way is no way"
 
 
 def test_same_seed_same_bits_for_any_number_of_threads(three, states):

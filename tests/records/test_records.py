@@ -18,7 +18,7 @@ from dmsrd_lite.method.airl import clone_demonstrations
 from dmsrd_lite.method.between_class_discrimination import recognized
 from dmsrd_lite.method.policy_mixture import Mixtures
 from dmsrd_lite.method.rewards import Rewards
-from dmsrd_lite.workbook import presets
+from dmsrd_lite.workbook import benchmark, presets
 from dmsrd_lite.workbook.records import RECORDS, settings_of
 
 
@@ -115,6 +115,20 @@ def test_fresh_policies_learn_again_as_recorded(name):
             again = [r["environment_return"] / r["horizon"] for r in steps]
             moved = np.median(np.abs(np.array(again) - known["curves"][:2]), axis=1)
             assert (moved < stored.FIRST_UPDATE[domain.name]).all(), (label, moved)
+
+
+@pytest.mark.parametrize("name", of("07"))
+def test_recorded_estimates_of_the_task_correlate_as_recorded(name):
+    """What the benchmark stored of 10,000 trajectories gives the correlations of its table."""
+    record, tensors = stored.record_of(name)
+    domain, scores = record["parameters"]["domain"], record["results"]["scores"]
+    test, settings = stored.rewards_test_set(domain), presets.choose("07_benchmark", domain, "full")
+    for label, estimated in tensors.items():
+        method, start = label.split(", ")
+        if method in benchmark.SHARED:
+            row = scores[label][str(settings.main if start == "nothing" else settings.from_clone)]
+            found = vars(reward_correlations(test, estimated.astype(float)))
+            assert found == pytest.approx({k: row[k] for k in found}, abs=0.01, nan_ok=True), label
 
 
 @pytest.mark.verify
