@@ -18,7 +18,7 @@ FIRST_UPDATE = {  # true reward per step after one update, the median policy. An
     "inverted_pendulum": 0.002,  # a negated reward: 0.003 and more
     "lunar_lander": 0.03,  # a negated reward: 0.05 and more
 }
-# Who is recognised must come back exactly: the margins between mean rewards are far wider than rounding.
+RECOGNIZED = 1  # strategies: fresh takes fly another way on another CPU, and one may stand on the edge
 
 record_of = cache(load_record)
 

@@ -147,9 +147,16 @@ def test_weights_are_found_from_actions_as_recorded(name):
         assert [r[key] for r in again] == pytest.approx([r[key] for r in known], abs=stored.WEIGHT)
 
 
-def means_on_takes(rewards, acting, domain, seed, n_fresh):
-    """Mean rewards (M, n) on so many fresh takes of everybody, by their number."""
-    return {k: rewards.mean_rewards(people.fresh_takes(acting, domain, k, [seed, 60, k])) for k in n_fresh}
+def fresh_takes(acting, domain, seed, n_fresh):
+    """So many fresh takes of everybody, by their number."""
+    return {k: people.fresh_takes(acting, domain, k, [seed, 60, k]) for k in n_fresh}
+
+
+def assert_known(rewards, takes, pure, known, label):
+    """As many strategy rewards know their person as ``known`` says, by the number of takes."""
+    for k, some in takes.items():
+        count = recognized(rewards.mean_rewards(some), pure).sum()
+        assert count == pytest.approx(known[str(k)], abs=stored.RECOGNIZED), f"{label}, {k} takes"
 
 
 @pytest.mark.verify
@@ -158,15 +165,14 @@ def test_recorded_strategy_rewards_recognise_again_as_recorded(name):
     record, tensors, domain, seed = prepared(name)
     settings, weights = record["settings"], np.array(record["results"]["weights"])
     acting = Mixtures(people.load_shipped_demonstrators(domain).select(settings["users"]), weights)
+    takes = fresh_takes(acting, domain, seed, settings["n_fresh"])
     test = stored.rewards_test_set(domain.name, "development_set")
     for label, known in islice(record["results"]["table"].items(), 4):  # ablations keep only numbers
         rewards = Rewards(domain, weights.shape[1], 0.99, 0, settings["msrd"]["alpha"])
         kept = {k: torch.tensor(v) for k, v in under(label, tensors).items()}
         rewards.load_state_dict(kept, strict=False)  # shaping is not kept
-        means = means_on_takes(rewards, acting, domain, seed, settings["n_fresh"])
-        for k, found in means.items():
-            count = recognized(found, range(weights.shape[1])).sum()
-            assert count == known["recognized"][f"{k} fresh"], f"{label}, {k} takes"
+        counted = {str(k): known["recognized"][f"{k} fresh"] for k in takes}
+        assert_known(rewards, takes, range(weights.shape[1]), counted, label)
         task = rewards.evaluate(test.observations, "task")[0].mean(1)
         assert reward_correlations(test, task).pearson == pytest.approx(known["task"], abs=stored.CORRELATION)
 
@@ -181,6 +187,7 @@ def test_recorded_runs_of_algorithm_1_score_again_as_recorded(name):
     mixed = people.fresh_takes(Mixtures(own_people, settings["mixtures"]), domain, 3, [seed, 50])
     shown = stored.demonstrations(domain.name).joined(mixed).select(arrival)
     acting, test = Mixtures(own_people, weights[arrival]), stored.rewards_test_set(domain.name)
+    takes = fresh_takes(acting, domain, seed, settings["n_fresh"])
     for label, known in record["results"]["table"].items():
         n_strategies, alpha = len(known["pure"]), settings["loop"]["msrd"]["alpha"]
         learned = comparison.restore(under(label, tensors), shown, alpha, known["pure"])
@@ -189,9 +196,7 @@ def test_recorded_runs_of_algorithm_1_score_again_as_recorded(name):
         assert reward_correlations(test, task).pearson == pytest.approx(
             known["pearson"], abs=stored.CORRELATION
         )
-        means = means_on_takes(learned.rewards, acting, domain, seed, settings["n_fresh"])
-        for k, found in means.items():
-            assert recognized(found, known["pure"]).sum() == known["recognized_fresh"][str(k)], label
+        assert_known(learned.rewards, takes, known["pure"], known["recognized_fresh"], label)
         assert n_strategies == learned.policies.n_strategies
 
 
@@ -232,5 +237,5 @@ def test_the_hundred_score_again_as_recorded(name):
     )
     everybody = people.stream_actor(stored.demonstrations(domain.name, "lifelong"))
     acting = Mixtures(everybody.actor, everybody.weights[found["arrival"]])
-    ((k, means),) = means_on_takes(learned.rewards, acting, domain, seed, (3,)).items()
-    assert recognized(means, known["pure"]).sum() == known["recognized_fresh"][str(k)]
+    takes = fresh_takes(acting, domain, seed, (3,))
+    assert_known(learned.rewards, takes, known["pure"], known["recognized_fresh"], label)
