@@ -111,9 +111,12 @@ def test_a_notebook_runs_and_fits_the_page(name, browser, server):
     for i in range(shown.count()):  # a cell is drawn when it comes into sight
         shown.nth(i).scroll_into_view_if_needed()
     assert not opened.page.evaluate(TOO_WIDE, ".jp-RenderedHTMLCommon, .jp-RenderedImage, .jp-Notebook")
+    figures = opened.page.locator(".jp-Notebook .jp-RenderedImage")
+    if figures.count():
+        figures.first.scroll_into_view_if_needed()
     for theme in ("JupyterLab Dark", "JupyterLab Light"):
         opened.do("apputils:change-theme", theme=theme)
-        opened.page.wait_for_timeout(500)
+        opened.page.wait_for_timeout(1500)
         opened.picture(f"{name.replace('/', '_')}_{theme.split()[1].lower()}")
     opened.page.close()
 
@@ -143,6 +146,35 @@ def test_a_slider_changes_its_picture_which_stays_without_a_kernel(browser, serv
     again.page.close()
 
 
+def test_somebody_steers_by_the_keyboard_and_is_recorded(browser, server):
+    opened = Opened(browser, server, "09_beyond")
+    page, cells = opened.page, nbformat.read(NOTEBOOKS / "09_beyond.ipynb", 4).cells
+    (steering,) = (i for i, cell in enumerate(cells) if cell.source.endswith("cockpit(steering)"))
+    activate = "k => { window.jupyterapp.shell.currentWidget.content.activeCellIndex = k }"
+    page.evaluate(activate, steering + 1)
+    opened.do("notebook:run-all-above")
+    handle = page.locator(".jp-Notebook .noUi-handle").first
+    handle.scroll_into_view_if_needed()
+    picture = page.locator(".jp-Notebook .widget-image").first
+    first = picture.get_attribute("src")
+    handle.focus()
+    for _ in range(4):
+        handle.press("ArrowRight")
+    clock = page.locator(".jp-Notebook .widget-play button").first
+    clock.click()
+    page.wait_for_function("([image, first]) => image.src !== first", arg=[picture.element_handle(), first])
+    page.wait_for_timeout(3000)
+    opened.picture("steering")
+    clock.click()
+    page.evaluate(activate, steering + 2)
+    opened.do("notebook:run-cell")
+    opened.do("docmanager:save")
+    asked = nbformat.read(opened.path, 4).cells[steering + 2]
+    assert asked.execution_count
+    assert not asked.outputs  # else: nobody steers
+    page.close()
+
+
 def test_a_link_leads_to_the_next_lesson_and_a_wrong_parameter_to_one_sentence(browser, server):
     opened = Opened(browser, server, "00_start_here")
     page = opened.page
@@ -161,6 +193,7 @@ def test_a_link_leads_to_the_next_lesson_and_a_wrong_parameter_to_one_sentence(b
     (sentence,) = errors(opened.run_all())
     assert "pendulm" in sentence
     assert len(sentence.splitlines()) == 1
+    opened.page.locator(".jp-Notebook .jp-OutputArea", has_text=sentence).first.scroll_into_view_if_needed()
     opened.picture("wrong_parameter")
     opened.page.close()
 
