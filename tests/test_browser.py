@@ -1,5 +1,6 @@
 """The lessons in a real JupyterLab, and the book, in headless Chromium. Pictures: ``build/screenshots``."""
 
+import os
 import shutil
 import socket
 import subprocess
@@ -39,7 +40,7 @@ def server(tmp_path_factory):
     """A JupyterLab on loopback, as ``make lab`` sets it up: the folder of its lessons, and its address."""
     folder = tmp_path_factory.mktemp("lab")
     lab.copy_lessons(folder / "mine")
-    lab.configure()
+    environment = {**os.environ, **lab.configure()}
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -51,7 +52,7 @@ def server(tmp_path_factory):
     ]
     log = (folder / "log").open("w")
     process = subprocess.Popen(
-        [sys.executable, "-m", "jupyterlab", *options], stdout=log, stderr=log, cwd=folder
+        [sys.executable, "-m", "jupyterlab", *options], stdout=log, stderr=log, cwd=folder, env=environment
     )
     address = f"http://127.0.0.1:{port}"
     for _ in range(120):

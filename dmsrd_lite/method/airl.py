@@ -29,8 +29,8 @@ WORDS = {  # of the settings that are words
     "penalty_points": ("between", "samples", "demonstrations"),
 }
 ENTROPY_WEIGHTS = (0.002, 0.1)  # within which c is tuned
-REPLAY_SIZE = 100_000  # samples per strategy that a replay of all iterations holds at most ...
-N_ANCHORS = 4000  # ... and of which so many go on to a later learner
+REPLAY_SIZE = 100_000  # samples per strategy that a replay of all iterations holds at most
+N_ANCHORS, PER_ITERATION = 4000, 40  # so many go on to a later learner, of so many of every iteration
 Samples = tuple[
     torch.Tensor, torch.Tensor, torch.Tensor
 ]  # x (M, n, obs_dim), x' (M, n, obs_dim), log-density (M, n)
@@ -93,6 +93,13 @@ class AIRLSettings:
         if self.first_horizon < 0 or self.growth < 1 or (self.first_horizon and self.growth == 1):
             text = "expected a growth above 1 from a first horizon of at least 1 step, or 0: whole episodes"
             raise InputError(f"growth {self.growth!r} from first_horizon {self.first_horizon!r}: {text}")
+
+
+def _evenly(samples: Samples, n: int) -> Samples:
+    """``n`` of the samples (M, many, ...), evenly spread."""
+    x, x_next, log_pi = samples
+    some = torch.linspace(0, x.shape[1] - 1, n).long()
+    return x[:, some], x_next[:, some], log_pi[:, some]
 
 
 @torch.no_grad()
@@ -182,7 +189,8 @@ class AIRL:
         self.task_learns = task_learns
         self.replay: deque[Samples] = deque(maxlen=settings.replay_iterations or None)
         self.coverage: list[Samples] = []
-        self.anchors: list[Samples] = []  # of an earlier learner's replay: what it saw on the way
+        self.passed: list[Samples] = []  # a few of every iteration's samples, when the replay has forgotten
+        self.anchors: list[Samples] = []  # what an earlier learner passed on the way
         self.iterates: list[Rewards] = []
         self.every = self.thinning = 1  # which iterations and samples are kept
         self.entropy_weights = np.full(m, settings.entropy_weight)  # c of each strategy
@@ -216,13 +224,10 @@ class AIRL:
         return found
 
     def _anchors(self) -> list[Samples]:
-        """From nothing a learner sees failure only on the way: an even choice of all that was in its
-        replay."""
-        if self.settings.start == "clone" or not self.replay:
+        """From nothing a learner sees failure only on the way: an even choice of all that it passed."""
+        if self.settings.start == "clone" or not self.passed:
             return []
-        x, x_next, log_pi = self._joined(list(self.replay))
-        some = torch.linspace(0, x.shape[1] - 1, N_ANCHORS).long()
-        return [(x[:, some], x_next[:, some], log_pi[:, some])]
+        return [_evenly(self._joined(self.passed), N_ANCHORS)]
 
     def _restore(self, networks: dict[str, torch.Tensor]) -> None:
         for name, module in self.modules.items():
@@ -328,6 +333,7 @@ class AIRL:
 
     def _remember(self, new: Samples) -> None:
         """Into the replay; of all iterations' samples every second is dropped whenever they get too many."""
+        self.passed.append(_evenly(new, PER_ITERATION))
         x, x_next, log_pi = (part[:, :: self.thinning] for part in new)
         self.replay.append((x, x_next, log_pi))
         held = sum(x.shape[1] for x, *_ in self.replay)
@@ -369,7 +375,8 @@ class AIRL:
         if s.coverage == "half":
             self.coverage = sources
         else:
-            self.replay.extend(sources)
+            for source in sources:
+                self._remember(source)
 
     @staticmethod
     def _joined(sources: Sequence[Samples]) -> Samples:

@@ -189,20 +189,38 @@ def grade(course: str | Path, submissions: str | Path, progress: Callable = iter
             what = text if gradable else f"not graded: {text}"
             notes.append({"student": student, "lesson": lesson, "note": what})
     pd.DataFrame(notes, columns=["student", "lesson", "note"]).to_csv(course / "notes.csv", index=False)
-    return report(course)
+    return _table(course)
 
 
 def report(course: str | Path) -> Path:
     """``course/grades.csv``: points of every student and lesson, and what was noticed.
 
-    The feedback pages lie in ``course/feedback/STUDENT/LESSON``.
+    The feedback pages lie in ``course/feedback/STUDENT/LESSON``; those with points that somebody entered are
+    made anew.
     """
-    course, rows = _course(course), []
+    course = _course(course)
+    api, read = _nbgrader(course), []
+    with api.gradebook as book:
+        for assignment in book.assignments:
+            for one in assignment.submissions:
+                if any(grade.manual_score is not None for page in one.notebooks for grade in page.grades):
+                    read.append((assignment.name, one.student.id))
+    for lesson, student in read:
+        _expect(api.generate_feedback(lesson, student, force=True), f"the page of {student} was not made")
+    return _table(course)
+
+
+def _table(course: Path) -> Path:
+    """``grades.csv``, from nbgrader's gradebook and ``notes.csv``."""
+    rows = []
     with _nbgrader(course).gradebook as book:
         for assignment in book.assignments:
             for one in assignment.submissions:
-                to_read = one.max_written_score if one.needs_manual_grade else 0
-                rows.append((one.student.id, assignment.name, one.score, assignment.max_score, to_read))
+                grades = [grade for page in one.notebooks for grade in page.grades]
+                unread = (g.max_score for g in grades if g.needs_manual_grade and g.manual_score is None)
+                rows.append((one.student.id, assignment.name, one.score, assignment.max_score, sum(unread)))
+    if not rows and not _notes(course):
+        raise InputError(f"{course}: nothing was graded yet; expected `classroom grade` first")
     table = pd.DataFrame(rows, columns=["student", "lesson", "points", "of", "to_read"])
     if noted := _notes(course):
         notes = pd.DataFrame(noted).groupby(["student", "lesson"], as_index=False).note.agg("; ".join)

@@ -34,17 +34,21 @@ def open_lab(as_root: bool = False) -> int:
         )
         raise InputError(f"{text} ('make lab ROOT=--root') if you know that nobody else reaches this machine")
     print(copy_lessons(), flush=True)
-    configure()
+    environment = {**os.environ, **configure()}
     page = f"--LabApp.default_url=/lab/tree/{MINE.name}/START.md"
     command = [sys.executable, "-m", "jupyterlab", f"--ServerApp.root_dir={ROOT}", page]
-    os.execv(sys.executable, [*command, *(["--allow-root"] if as_root else [])])
+    command += ["--allow-root"] if as_root else []
+    os.execve(sys.executable, command, environment)
 
 
-def configure() -> None:
-    """Set up this environment's JupyterLab for the lessons (``CONFIG``)."""
+def configure() -> dict[str, str]:
+    """Write ``CONFIG``; the environment variable by which a JupyterLab takes it, and no other one does: a
+    course of nbgrader needs its panels."""
+    folder = Path(sys.prefix) / "etc/dmsrd_lite"
     for name, content in CONFIG.items():
-        path = check_folder(Path(sys.prefix) / "etc/jupyter/labconfig" / name)
-        path.write_text(json.dumps(content))
+        check_folder(folder / "labconfig" / name).write_text(json.dumps(content))
+    known = os.environ.get("JUPYTER_CONFIG_PATH", "")
+    return {"JUPYTER_CONFIG_PATH": os.pathsep.join([str(folder), *filter(None, [known])])}
 
 
 def copy_lessons(folder: Path = MINE) -> str:

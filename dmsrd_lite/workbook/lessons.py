@@ -58,7 +58,7 @@ class Lesson:
 
 
 def start(
-    name: str, domain: str, preset: str, seed: int, *, custom: bool = False, **parameters: Any
+    name: str, domain: str | Domain, preset: str, seed: int, *, custom: bool = False, **parameters: Any
 ) -> Lesson:
     """Check a lesson's parameters, choose its settings (``presets.choose``), set the figures' style, and
     print the settings.
@@ -66,9 +66,10 @@ def start(
     ``InputError``, one sentence, for a parameter that cannot be used; those that change no setting of
     ``presets`` are not given, but said by ``custom`` if they are not at their defaults (a file of your own).
     """
-    found, number = get_domain(domain), check_whole(seed, "seed")
-    settings = presets.choose(name, domain, preset, **parameters)
-    is_default = not custom and number == 0 and settings == presets.choose(name, domain, preset)
+    found = domain if isinstance(domain, Domain) else get_domain(domain)  # run again, it is what it became
+    number = check_whole(seed, "seed")
+    settings = presets.choose(name, found.name, preset, **parameters)
+    is_default = not custom and number == 0 and settings == presets.choose(name, found.name, preset)
     figures.use_style()
     print(f"{name}: {found.title}, preset {preset}, seed {number}")
     print(describe(settings))

@@ -54,6 +54,8 @@ class Plan:
 def load_plan(path: str | Path, folder: str | Path | None = None) -> Plan:
     """Read a plan for results in ``folder`` or ``papermill_runs/NAME``; ``InputError`` names all faults."""
     path = Path(path).resolve()
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file; expected a plan")
     try:
         raw = tomllib.loads(path.read_text())
     except (OSError, ValueError) as error:
@@ -148,7 +150,9 @@ def read_table(folder: str | Path) -> Any:
     """All records of a folder as a ``pandas.DataFrame``, one run a row; metrics as ``metrics.NAME``."""
     import pandas as pd
 
-    return pd.json_normalize([read_record(path) for path in sorted(Path(folder).glob("*.json"))])
+    if not (paths := sorted(Path(folder).glob("*.json"))):
+        raise InputError(f"{folder}: no records in it; expected the folder of a plan that ran")
+    return pd.json_normalize([read_record(path) for path in paths])
 
 
 def why(run: Run, folder: Path) -> str:

@@ -502,7 +502,7 @@ def _small(quick: bool, episodes: int) -> dict[str, Any]:
     return {"episodes": 2, "cloning_steps": 1000} if quick else {"episodes": episodes}
 
 
-_SHORT = TrainingSettings(n_strategies=4, episodes=5, growing=1e9)
+_SHORT = TrainingSettings(n_strategies=4, episodes=5, growing=float("inf"))
 LESSONS: dict[str, Any] = {  # (domain, quick) -> settings
     "00_start_here": lambda domain, quick: Start(5 if quick else 20),
     "01_demonstrations": lambda domain, quick: Demonstrations(

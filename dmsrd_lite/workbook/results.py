@@ -89,6 +89,16 @@ def _numbers(record: dict, domain: Domain) -> Iterator[tuple[str, str, Any]]:
         yield "ours, a thousand users", "strategies", len(r["pure"])
         yield "ours, a thousand users", "pearson", r["looks"][-1]["pearson"]
         return
+    if "drift" in r:  # lesson 09
+        for row in r["drift"]:
+            yield f"reward: {row['reward']}", "pearson", row["Pearson"]
+            yield f"fresh policies on: {row['reward']}", "able", row["of ten"] / 10
+        first, second = record["settings"]["pair"]
+        for metric in ("KL(wants || acts)", "KL(acts || wants)", "return, wants", "return, acts"):
+            values = r["wanting"][metric]
+            for share, value in zip(np.linspace(0, 1, len(values)), values, strict=True):
+                yield f"{1 - share:g} of {first}, {share:g} of {second}", metric, value
+        return
     floor, own = np.array(r["floor"]), np.array(r["own_log_likelihood"])
     for k, scores in enumerate(r.get("orders", ())):
         yield from _scores(f"ours, order {k}", scores, domain, floor[scores["order"]], own[scores["order"]])

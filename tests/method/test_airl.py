@@ -332,16 +332,18 @@ def test_a_first_horizon_needs_a_horizon_to_grow_to(small_set):
 
 
 def test_from_nothing_a_later_learner_still_sees_what_was_on_the_way(small_set, monkeypatch):
-    """An even choice of the whole replay goes on, unchanged from learner to learner, in every pool."""
+    """An even choice of all iterations goes on, unchanged from learner to learner, in every pool: also of
+    those that the replay has forgotten."""
     monkeypatch.setattr(airl, "N_ANCHORS", 12)
-    settings = replace(AIRL_ONE, **AS_IN_THE_PAPER)
+    monkeypatch.setattr(airl, "PER_ITERATION", 6)
+    settings = replace(AIRL_ONE, **{**AS_IN_THE_PAPER, "replay_iterations": 1})
     first = AIRL(small_set, settings, 0)
-    list(first.train())
-    seen = first._joined(list(first.replay))
+    seen = [first.replay[0] for _ in first.train()]
+    assert len(seen) == settings.n_iterations == 2
     networks = first.networks()
-    some = np.linspace(0, seen[0].shape[1] - 1, 12).astype(int)
-    for part, whole in zip(range(3), seen, strict=True):
-        assert torch.equal(networks[f"anchors.{part}"], whole[:, some])
+    for part in range(3):
+        taken = [one[part][:, np.linspace(0, one[part].shape[1] - 1, 6).astype(int)] for one in seen]
+        assert torch.equal(networks[f"anchors.{part}"], torch.cat(taken, 1))
     second = AIRL(small_set, settings, 1, networks=networks)
     pools = []
     joined = AIRL._joined

@@ -88,6 +88,7 @@ def test_bad_input_is_one_sentence(course, tmp_path, capsys):
         ("release", ROOT / "class"): "inside of this repository; expected a folder outside",
         ("grade", course, tmp_path / "nobody"): "no notebook in it; expected STUDENT/LESSON.ipynb",
         ("report", tmp_path / "nowhere"): "no course; expected a folder made by",
+        ("report", course): "nothing was graded yet; expected `classroom grade` first",
     }.items():
         assert main(["classroom", *map(str, arguments)]) == 2
         said = capsys.readouterr().err.strip()
@@ -191,3 +192,10 @@ def test_a_class_of_all_sorts(course, tmp_path):
     hand_in(other, "kim", "this is no notebook")
     table = pd.read_csv(classroom.grade(course, other), keep_default_na=False).set_index("student")
     assert {"cleo", "kim"} <= set(table.index[table.note != ""]), "notes of other folders stay"
+    with classroom._nbgrader(course).gradebook as book:
+        book.find_grade("open", LESSON, LESSON, "ada").manual_score = 1.5
+        book.db.commit()
+    table = pd.read_csv(classroom.report(course), keep_default_na=False).set_index("student")
+    assert float(table.points["ada"]) == full + 1.5
+    assert float(table.to_read["ada"]) == 0
+    assert f"Score: {full + 1.5}" in (course / "feedback" / "ada" / LESSON / f"{LESSON}.html").read_text()

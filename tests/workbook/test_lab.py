@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -26,7 +27,7 @@ def test_the_lessons_are_copied_once_and_never_overwritten(tmp_path):
 @pytest.mark.parametrize(("user", "as_root"), [(1000, False), (0, True), (0, False)])
 def test_it_opens_on_the_start_page_and_root_is_told_what_to_do(user, as_root, tmp_path, monkeypatch):
     commands = []
-    monkeypatch.setattr(os, "execv", lambda _, command: commands.append(command))
+    monkeypatch.setattr(os, "execve", lambda _, command, environment: commands.append((command, environment)))
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.setattr(lab, "copy_lessons", lambda: "copied")
     monkeypatch.setattr(os, "geteuid", lambda: user, raising=False)
@@ -36,8 +37,11 @@ def test_it_opens_on_the_start_page_and_root_is_told_what_to_do(user, as_root, t
         assert not commands
         return
     lab.open_lab(as_root)
-    assert commands[0][:3] == [sys.executable, "-m", "jupyterlab"]
-    assert any(part.endswith("/lab/tree/my_notebooks/START.md") for part in commands[0])
-    assert ("--allow-root" in commands[0]) == as_root
-    page = json.loads((tmp_path / "etc/jupyter/labconfig/page_config.json").read_text())
+    ((command, environment),) = commands
+    assert command[:3] == [sys.executable, "-m", "jupyterlab"]
+    assert any(part.endswith("/lab/tree/my_notebooks/START.md") for part in command)
+    assert ("--allow-root" in command) == as_root
+    folder, *_ = environment["JUPYTER_CONFIG_PATH"].split(os.pathsep)
+    assert not (tmp_path / "etc/jupyter").exists(), "a course of nbgrader needs its panels"
+    page = json.loads((Path(folder) / "labconfig/page_config.json").read_text())
     assert page["disabledExtensions"]["@jupyter/nbgrader:course-list"] is True

@@ -28,6 +28,8 @@ def test_a_lesson_prints_what_it_runs_with(capsys):
     first, *settings = capsys.readouterr().out.strip().splitlines()
     assert first == "03_msrd: Inverted Pendulum, preset quick, seed 0"
     assert "alpha 1.5" in " ".join(settings)
+    again = begin(alpha=1.5, domain=lesson.domain)  # the cell run once more, after ``domain = lesson.domain``
+    assert (again.domain, again.settings) == (lesson.domain, lesson.settings)
 
 
 @pytest.mark.parametrize(
