@@ -15,7 +15,7 @@ from dmsrd_lite.__main__ import main
         ("generate cartpole", "unknown domain 'cartpole'"),
         ("generate inverted_pendulum --seed 1.5", "seed '1.5': expected a whole number"),
         ("generate inverted_pendulum --output FILE/x", "cannot be written to"),
-        ("run none.toml", "cannot be read as a plan"),
+        ("run none.toml", "there is no such file; expected a plan"),
         ("bench --seed x", "seed 'x': expected a whole number"),
         ("bench --iterations 1", "iterations '1': expected a whole number of at least 2"),
         ("gallery .", "holds no executed notebook with a figure for the gallery"),
