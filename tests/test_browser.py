@@ -191,7 +191,7 @@ def test_a_link_leads_to_the_next_lesson_and_a_wrong_parameter_to_one_sentence(b
             sharedModel.setSource(typed);
         }
     }""")
-    (sentence,) = errors(opened.run_all())
+    sentence, *_ = errors(opened.run_all())  # on a busy machine a later cell may run before it is cancelled
     assert "pendulm" in sentence
     assert len(sentence.splitlines()) == 1
     opened.page.locator(".jp-Notebook .jp-OutputArea", has_text=sentence).first.scroll_into_view_if_needed()
