@@ -10,7 +10,7 @@ import shutil
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -199,12 +199,13 @@ def report(course: str | Path) -> Path:
     made anew.
     """
     course = _course(course)
-    api, read = _nbgrader(course), []
+    api = _nbgrader(course)
     with api.gradebook as book:
-        for assignment in book.assignments:
-            for one in assignment.submissions:
-                if any(grade.manual_score is not None for page in one.notebooks for grade in page.grades):
-                    read.append((assignment.name, one.student.id))
+        read = [
+            (assignment.name, one.student.id)
+            for assignment, one, grades in _graded(book)
+            if any(grade.manual_score is not None for grade in grades)
+        ]
     for lesson, student in read:
         _expect(api.generate_feedback(lesson, student, force=True), f"the page of {student} was not made")
     return _table(course)
@@ -214,11 +215,9 @@ def _table(course: Path) -> Path:
     """``grades.csv``, from nbgrader's gradebook and ``notes.csv``."""
     rows = []
     with _nbgrader(course).gradebook as book:
-        for assignment in book.assignments:
-            for one in assignment.submissions:
-                grades = [grade for page in one.notebooks for grade in page.grades]
-                unread = (g.max_score for g in grades if g.needs_manual_grade and g.manual_score is None)
-                rows.append((one.student.id, assignment.name, one.score, assignment.max_score, sum(unread)))
+        for assignment, one, grades in _graded(book):
+            unread = (g.max_score for g in grades if g.needs_manual_grade and g.manual_score is None)
+            rows.append((one.student.id, assignment.name, one.score, assignment.max_score, sum(unread)))
     if not rows and not _notes(course):
         raise InputError(f"{course}: nothing was graded yet; expected `classroom grade` first")
     table = pd.DataFrame(rows, columns=["student", "lesson", "points", "of", "to_read"])
@@ -227,6 +226,13 @@ def _table(course: Path) -> Path:
         table = table.merge(notes, "outer", ["student", "lesson"])
     table.sort_values(["lesson", "student"]).to_csv(course / "grades.csv", index=False)
     return course / "grades.csv"
+
+
+def _graded(book: Any) -> Iterator[tuple[Any, Any, list]]:
+    """Assignment, submission and its grades, for all that a gradebook holds."""
+    for assignment in book.assignments:
+        for one in assignment.submissions:
+            yield assignment, one, [grade for page in one.notebooks for grade in page.grades]
 
 
 def _notes(course: Path) -> list[dict[str, str]]:

@@ -34,7 +34,7 @@ def open_lab(as_root: bool = False) -> int:
         )
         raise InputError(f"{text} ('make lab ROOT=--root') if you know that nobody else reaches this machine")
     print(copy_lessons(), flush=True)
-    environment = {**os.environ, **configure()}
+    environment = configure()
     page = f"--LabApp.default_url=/lab/tree/{MINE.name}/START.md"
     command = [sys.executable, "-m", "jupyterlab", f"--ServerApp.root_dir={ROOT}", page]
     command += ["--allow-root"] if as_root else []
@@ -42,13 +42,13 @@ def open_lab(as_root: bool = False) -> int:
 
 
 def configure() -> dict[str, str]:
-    """Write ``CONFIG``; the environment variable by which a JupyterLab takes it, and no other one does: a
-    course of nbgrader needs its panels."""
+    """Write ``CONFIG``; the environment in which a JupyterLab takes it, and no other one does: a course of
+    nbgrader needs its panels."""
     folder = Path(sys.prefix) / "etc/dmsrd_lite"
     for name, content in CONFIG.items():
         check_folder(folder / "labconfig" / name).write_text(json.dumps(content))
     known = os.environ.get("JUPYTER_CONFIG_PATH", "")
-    return {"JUPYTER_CONFIG_PATH": os.pathsep.join([str(folder), *filter(None, [known])])}
+    return {**os.environ, "JUPYTER_CONFIG_PATH": os.pathsep.join([str(folder), *filter(None, [known])])}
 
 
 def copy_lessons(folder: Path = MINE) -> str:
