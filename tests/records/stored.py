@@ -11,6 +11,7 @@ from dmsrd_lite.domains import DOMAINS
 from dmsrd_lite.workbook.records import load_record
 
 LIKELIHOOD = 1e-3  # nats per step: stored networks on stored actions
+LIKELIHOOD_FLOWN = 0.03  # nats per step: stored networks on actions of flights flown again
 CORRELATION = 1e-3  # stored networks on 10,000 stored trajectories
 DIVERGENCE = 0.3  # nats: new rollouts of policies that seldom fail
 WEIGHT = 0.02  # of a mixture, from the actions: the clones are trained again

@@ -60,11 +60,11 @@ def prepared(name):
     return record, tensors, DOMAINS[record["parameters"]["domain"]], record["parameters"]["seed"]
 
 
-def assert_policies_score(actor, shown, seed, known, label):
-    """As the record says, but for what rounding does to rollouts."""
+def assert_policies_score(actor, shown, seed, known, label, flown_again=False):
+    """As the record says, but for what rounding does to rollouts (also of demonstrations flown again)."""
     scores = score_policies(actor, shown, [seed, 99])
-    likelihood = scores["log_likelihood_per_step"]
-    assert likelihood == pytest.approx(known["log_likelihood_per_step"], abs=stored.LIKELIHOOD), label
+    moved = np.abs(scores["log_likelihood_per_step"] - known["log_likelihood_per_step"])
+    assert (moved < np.where(flown_again, stored.LIKELIHOOD_FLOWN, stored.LIKELIHOOD)).all(), (label, moved)
     spared = np.equal(known["failure_share"], 0) & (scores["failure_share"] == 0)
     close = np.abs(scores["divergence"] - known["divergence"]) < stored.DIVERGENCE
     assert close[spared].sum() >= 0.9 * spared.sum(), f"{label}: of those that never fail"
@@ -191,7 +191,8 @@ def test_recorded_runs_of_algorithm_1_score_again_as_recorded(name):
     for label, known in record["results"]["table"].items():
         n_strategies, alpha = len(known["pure"]), settings["loop"]["msrd"]["alpha"]
         learned = comparison.restore(under(label, tensors), shown, alpha, known["pure"])
-        assert_policies_score(learned.actor(), shown, seed, known, label)
+        mixtures = np.array(arrival) >= len(settings["users"])
+        assert_policies_score(learned.actor(), shown, seed, known, label, mixtures)
         task = learned.rewards.evaluate(test.observations, "task")[0].mean(1)
         assert reward_correlations(test, task).pearson == pytest.approx(
             known["pearson"], abs=stored.CORRELATION
