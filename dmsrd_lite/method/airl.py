@@ -30,7 +30,7 @@ WORDS = {  # of the settings that are words
 }
 ENTROPY_WEIGHTS = (0.002, 0.1)  # within which c is tuned
 REPLAY_SIZE = 100_000  # samples per strategy that a replay of all iterations holds at most
-N_ANCHORS, PER_ITERATION = 4000, 40  # so many go on to a later learner, of so many of every iteration
+N_ANCHORS = 4000  # samples per strategy that go on to a later learner
 Samples = tuple[
     torch.Tensor, torch.Tensor, torch.Tensor
 ]  # x (M, n, obs_dim), x' (M, n, obs_dim), log-density (M, n)
@@ -67,6 +67,7 @@ class AIRLSettings:
     grow_below: float = 0.75  # ... the discriminator's smoothed accuracy (its 70 % quantile) is below this
     replay_iterations: int = 10  # policy samples of so many iterations are kept; 0: of all, thinned
     replay_samples: int = 2000  # per strategy and iteration
+    anchor_samples: int = 40  # of every iteration, from nothing, for a later learner; 0: the replay's end
     n_iterates: int = 0  # rewards kept for their mean (``mean_of_iterates``), spread over the iterations
     iterates_share: float = 0.5  # which of them are used: the first ones
     reward_average: float = (
@@ -225,9 +226,8 @@ class AIRL:
 
     def _anchors(self) -> list[Samples]:
         """From nothing a learner sees failure only on the way: an even choice of all that it passed."""
-        if self.settings.start == "clone" or not self.passed:
-            return []
-        return [_evenly(self._joined(self.passed), N_ANCHORS)]
+        kept = self.passed or list(self.replay)
+        return [_evenly(self._joined(kept), N_ANCHORS)] if self.settings.start == "nothing" and kept else []
 
     def _restore(self, networks: dict[str, torch.Tensor]) -> None:
         for name, module in self.modules.items():
@@ -333,7 +333,8 @@ class AIRL:
 
     def _remember(self, new: Samples) -> None:
         """Into the replay; of all iterations' samples every second is dropped whenever they get too many."""
-        self.passed.append(_evenly(new, PER_ITERATION))
+        if self.settings.start == "nothing" and self.settings.anchor_samples:
+            self.passed.append(_evenly(new, self.settings.anchor_samples))
         x, x_next, log_pi = (part[:, :: self.thinning] for part in new)
         self.replay.append((x, x_next, log_pi))
         held = sum(x.shape[1] for x, *_ in self.replay)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import null_space
-from scipy.optimize import minimize, nnls
+from scipy.optimize import minimize
 
 from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.domains import InputError
@@ -91,17 +91,6 @@ def inside_bounds(actor: Actor, demonstration: DemonstrationSet) -> tuple[np.nda
 
 
 @one_thread()
-def regress_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
-    """The mixture whose means are nearest to what one demonstrator did: weights (M,), without a rollout.
-
-    ``min_w sum_t |a_t - sum_j w_j mu_j(s_t)|^2`` over the simplex, actions in half ranges.
-    """
-    a, mu, _ = (x.astype(np.float64) for x in inside_bounds(actor, demonstration))
-    one = 1e3 * np.sqrt(1 + len(a))  # a row that holds the sum of the weights at one
-    weights, _ = nnls(np.vstack([mu.T, np.full((1, len(mu)), one)]), np.append(a, one))
-    return weights / weights.sum()
-
-
 @one_thread()
 def likeliest_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
     """The mixture under which one demonstrator's actions are the most likely: weights (M,), without a

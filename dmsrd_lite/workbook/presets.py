@@ -297,6 +297,8 @@ class DMSRDLesson:  # 06
         found["task_learns as printed, nothing"] = replace(nothing, task_learns=False)
         moving = replace(nothing, policies_after_new=True, policies_after_mixture=True)
         found["policies learn in rounds, nothing"] = moving
+        airl = replace(nothing.airl, anchor_samples=0)
+        found["samples of AIRL's end alone, nothing"] = replace(nothing, airl=airl)
         return found | {"without BCD": replace(self.loop, between_class="never")}
 
 

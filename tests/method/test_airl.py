@@ -335,8 +335,7 @@ def test_from_nothing_a_later_learner_still_sees_what_was_on_the_way(small_set, 
     """An even choice of all iterations goes on, unchanged from learner to learner, in every pool: also of
     those that the replay has forgotten."""
     monkeypatch.setattr(airl, "N_ANCHORS", 12)
-    monkeypatch.setattr(airl, "PER_ITERATION", 6)
-    settings = replace(AIRL_ONE, **{**AS_IN_THE_PAPER, "replay_iterations": 1})
+    settings = replace(AIRL_ONE, **{**AS_IN_THE_PAPER, "replay_iterations": 1, "anchor_samples": 6})
     first = AIRL(small_set, settings, 0)
     seen = [first.replay[0] for _ in first.train()]
     assert len(seen) == settings.n_iterations == 2
@@ -353,6 +352,10 @@ def test_from_nothing_a_later_learner_still_sees_what_was_on_the_way(small_set, 
     assert second.steps == 2 * 50, "nothing is explored anew"
     kept = second.networks()
     assert same(*({k: v for k, v in n.items() if k.startswith("anchors")} for n in (networks, kept)))
+    first.settings = replace(settings, anchor_samples=0)
+    first.passed = []
+    last = [part[:, np.linspace(0, part.shape[1] - 1, 12).astype(int)] for part in seen[-1]]
+    assert all(torch.equal(first.networks()[f"anchors.{i}"], part) for i, part in enumerate(last))
     warm = AIRL(small_set, replace(AIRL_ONE, n_iterations=1), 0)
     list(warm.train())
     assert not any(name.startswith("anchors") for name in warm.networks()), "from a clone there is coverage"

@@ -233,19 +233,6 @@ def test_actions_at_a_bound_do_not_count(actor, domain):
     assert means.shape == sigmas.shape == (3, inside.sum())
 
 
-def test_regressed_weights_are_the_least_squares_on_the_simplex(actor):
-    """Against SciPy's general minimiser, and exact where the demonstration is a noiseless mixture."""
-    true = np.array([0.2, 0.5, 0.3])
-    exact = shown_by(Mixtures(actor.select(range(3), 1e-6), [true]))
-    assert policy_mixture.regress_weights(actor, exact) == pytest.approx(true, abs=0.02)
-    noisy = shown_by(balancers([-0.1]))
-    means, wanted = actor.mean(states_of(noisy, 3))[..., 0], noisy.actions[0].ravel()
-    simplex = {"bounds": [(0, 1)] * 3, "constraints": {"type": "eq", "fun": lambda w: w.sum() - 1}}
-    best = minimize(lambda w: np.square(wanted - w @ means).mean(), np.ones(3) / 3, tol=1e-12, **simplex)
-    found = check_weights(policy_mixture.regress_weights(actor, noisy), 3)
-    assert np.square(wanted - found @ means).mean() <= best.fun + 1e-6
-
-
 def test_likeliest_weights_are_told_by_sigma_where_the_means_are_equal():
     """Closed form: ``w s_0 + (1 - w) s_1`` is the root mean square distance of the actions from the mean."""
     one = balancers([0.0], sigma=0.1)
@@ -260,10 +247,11 @@ def test_likeliest_weights_are_told_by_sigma_where_the_means_are_equal():
 def test_likeliest_weights_are_the_least_squares_where_the_sigmas_are_equal():
     """Of these weights only one direction shows: the place."""
     shown = shown_by(Mixtures(THREE, [[0.2, 0.5, 0.3]]), 200)
-    functions = policy_mixture.likeliest_weights, policy_mixture.regress_weights
-    likeliest, regressed = (check_weights(weights(THREE, shown), 3) for weights in functions)
-    means = THREE.mean(states_of(shown, 3))[..., 0]
-    assert np.allclose(likeliest @ means, regressed @ means, atol=1e-3)
+    found = check_weights(policy_mixture.likeliest_weights(THREE, shown), 3)
+    means, acted = THREE.mean(states_of(shown, 3))[..., 0], shown.actions[0].ravel()
+    simplex = {"bounds": [(0, 1)] * 3, "constraints": {"type": "eq", "fun": lambda w: w.sum() - 1}}
+    best = minimize(lambda w: np.square(acted - w @ means).mean(), np.ones(3) / 3, tol=1e-12, **simplex)
+    assert np.allclose(found @ means, best.x @ means, atol=1e-3)
 
 
 def test_near_weights_from_actions_save_the_search():
