@@ -23,7 +23,7 @@ MIXTURE, BETTER_MIXTURE, NEW_STRATEGY = "mixture", "mixture, better than a new s
 
 AS_PRINTED: dict[str, Any] = {
     "add_task_reward": False, "task_learns": False, "between_class": "mixtures", "own_rollouts": 0,
-    "search_again": False, "policies_after_new": True, "policies_after_mixture": True,
+    "own_clones": False, "search_again": False, "policies_after_new": True, "policies_after_mixture": True,
     "from_actions": False,
 }  # fmt: skip
 
@@ -41,6 +41,7 @@ class DMSRDSettings:
     between_class: str = "always"  # Equation 4 after every branch, after "mixtures" only (the paper), "never"
     own_rollouts: int = 20  # it is asked on so many of each person's explanation from new starts; 0: on what
     # was shown (the paper)
+    own_clones: bool = False  # these are rollouts of a clone of each demonstration, not of its explanation
     search_again: bool = True  # an older mixture whose KL has risen above its eps (the paper: never)
     airl: AIRLSettings = AIRLSettings(n_iterations=12)
     msrd: MSRDSettings = MSRDSettings(n_iterations=5, episodes=4, discriminator_steps=24)  # a round

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dmsrd_lite.learning.rollouts import rollout
+from dmsrd_lite.method.airl import clone_demonstrations
 from dmsrd_lite.method.between_class_discrimination import states_of
 from dmsrd_lite.method.msrd import MSRD
 from dmsrd_lite.method.policy_mixture import search_mixture
@@ -74,10 +75,13 @@ def _states(
     """States of the people ``some`` for Equation 4, and the environment steps that they took.
 
     Of what they showed; or (``own_rollouts``) of what explains them, acting from new starts: what was shown
-    started in three places, and these are what is learned otherwise.
+    started in three places, and these are what is learned otherwise. With ``own_clones`` a clone of each
+    demonstration acts instead: from nothing an explanation need not act much like its person.
     """
     if settings.own_rollouts:
-        data = rollout(state.domain, state.mixtures(some), settings.own_rollouts, [*seed, 0])
+        shown, steps = state.shown.select(some), settings.airl.cloning_steps
+        clones = settings.own_clones and clone_demonstrations(shown, [*seed, 2], steps)[0].actor()
+        data = rollout(state.domain, clones or state.mixtures(some), settings.own_rollouts, [*seed, 0])
         observations, steps = data.observations, data.n_steps
     else:
         observations, steps = state.shown.select(some).observations, 0

@@ -131,9 +131,8 @@ METHODS_FROM_NOTHING = {
             airl=from_nothing(name, AIRLSettings(), n_iterations=_DMSRD_FROM_NOTHING[name]),
             msrd=_round_from_nothing(name, usual.dmsrd.msrd),
             task_learns=True,
-            own_rollouts={PENDULUM: 5, LANDER: 20}[
-                name
-            ],  # steps that AIRL would miss; few are enough (lesson 05)
+            own_rollouts={PENDULUM: 5, LANDER: 20}[name],  # AIRL would miss the steps; few do (lesson 05)
+            own_clones=True,  # its policies do not yet act much like their people
             policies_after_new=False,  # no cloning term would hold them near their demonstrations
             policies_after_mixture=False,
         ),
@@ -297,6 +296,7 @@ class DMSRDLesson:  # 06
         found["task_learns as printed, nothing"] = replace(nothing, task_learns=False)
         moving = replace(nothing, policies_after_new=True, policies_after_mixture=True)
         found["policies learn in rounds, nothing"] = moving
+        found["Equation 4 on explanations, nothing"] = replace(nothing, own_clones=False)
         airl = replace(nothing.airl, anchor_samples=0)
         found["samples of AIRL's end alone, nothing"] = replace(nothing, airl=airl)
         return found | {"without BCD": replace(self.loop, between_class="never")}
@@ -327,6 +327,8 @@ class BenchmarkLesson:  # 07
     main: int  # of which the tables are made
     from_clone: int  # the budget of everybody who starts from a clone
     live: MethodSettings  # of a small benchmark from a clone
+    clone: MethodSettings  # from each start; the budget replaces how long they train
+    nothing: MethodSettings
     n_fresh: tuple[int, ...] = (3, 10, 30)
 
     def trained_for(self, method: str, start: str) -> tuple[int, ...]:
@@ -339,7 +341,7 @@ class BenchmarkLesson:  # 07
 
     def methods(self, method: str, start: str, budget: int) -> MethodSettings:
         """With so many steps per demonstration, all told; AIRL in DMSRD gets what its rounds will leave."""
-        usual = {"clone": METHODS, "nothing": METHODS_FROM_NOTHING}[start][self.domain]
+        usual: MethodSettings = getattr(self, start)
         many, n, horizon = 100_000, len(self.users), get_domain(self.domain).horizon
         a_round = usual.dmsrd.msrd.n_iterations * usual.dmsrd.msrd.episodes
         own = usual.dmsrd.own_rollouts if method == "DMSRD" else 0
@@ -363,7 +365,8 @@ def _benchmark(domain: str, quick: bool) -> BenchmarkLesson:
     printed = {PENDULUM: (250_000, 500_000, 1_000_000), LANDER: (500_000,)}[domain]
     users = (0, 1, 3) if quick else tuple(range(10))
     from_clone = {PENDULUM: 300_000, LANDER: 150_000}[domain]
-    return BenchmarkLesson(domain, users, budgets, printed, 500_000, from_clone, live)
+    starts = METHODS[domain], METHODS_FROM_NOTHING[domain]
+    return BenchmarkLesson(domain, users, budgets, printed, 500_000, from_clone, live, *starts)
 
 
 @dataclass(frozen=True)

@@ -210,9 +210,10 @@ def test_a_state_goes_on_in_the_form_that_made_it(three, states):
 
 def test_as_printed_takes_every_deviation_back():
     rest = {"policies_after_new": False, "policies_after_mixture": False}
-    printed = replace(TINY, own_rollouts=5, remembered=2, **rest).as_printed()
+    printed = replace(TINY, own_rollouts=5, own_clones=True, remembered=2, **rest).as_printed()
     assert printed.form == "from clone with coverage, as printed"
     assert (printed.between_class, printed.own_rollouts, printed.remembered) == ("mixtures", 0, 0)
+    assert not printed.own_clones
     assert printed.policies_after_new
     assert printed.policies_after_mixture
     off = printed.add_task_reward, printed.task_learns, printed.search_again, printed.mixture.from_actions

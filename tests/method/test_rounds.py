@@ -7,6 +7,7 @@ from tiny import GENEROUS, PENDULUM, TINY, after, assert_same, copied, everythin
 
 from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method import rounds
+from dmsrd_lite.method.airl import clone_demonstrations
 from dmsrd_lite.method.between_class_discrimination import N_STATES
 from dmsrd_lite.method.policy_mixture import MixtureFit
 from dmsrd_lite.method.state import State
@@ -99,11 +100,15 @@ def test_equation_4_is_asked_after_some_branches(between_class, created, asked, 
     assert (made[0]["between"] is not None) == asked
 
 
-def test_equation_4_can_be_asked_on_rollouts_of_what_explains_people(mixed, monkeypatch):
+@pytest.mark.parametrize("own_clones", [False, True])
+def test_equation_4_can_be_asked_on_rollouts_of_what_explains_people(own_clones, mixed, monkeypatch):
+    """Or of a clone of each demonstration, the mixture's, too."""
     made = watch(monkeypatch, rounds, "MSRD")
-    _, _, steps = rounds.play_round(mixed, False, 1e9, replace(TINY, own_rollouts=2), [0])
+    settings = replace(TINY, own_rollouts=2, own_clones=own_clones)
+    _, _, steps = rounds.play_round(mixed, False, 1e9, settings, [0])
     states, weights, _ = made[0]["between"]
-    flown = rollout(mixed.domain, mixed.mixtures(), 2, [0, 7, 0])
+    clones = clone_demonstrations(mixed.shown, [0, 7, 2], TINY.airl.cloning_steps)[0].actor()
+    flown = rollout(mixed.domain, clones if own_clones else mixed.mixtures(), 2, [0, 7, 0])
     known = {tuple(row) for row in flown.observations[2].reshape(-1, 4)}
     assert {tuple(row) for row in states[2]} <= known
     assert steps["between_class"] == flown.n_steps
