@@ -173,25 +173,33 @@ def plot_weights(weights: np.ndarray, ax: Axes | None = None, labels: Sequence[o
     return ax
 
 
-def plot_decisions(records: Sequence[dict], floor: np.ndarray, ax: Axes | None = None) -> Axes:
+def plot_decisions(
+    records: Sequence[dict], floor: np.ndarray, ax: Axes | None = None, who: Sequence[str] = ()
+) -> Axes:
     """KL of the best mixture and of the new policy for each demonstration (records of DMSRD), on the colour
-    of the branch that was taken."""
+    of the branch that was taken; under each column ``who`` it is and the strategies so far."""
     ax = ax or plt.gca()
     x = np.arange(len(records))
-    branches = ((MIXTURE, "mixture", 0), (BETTER_MIXTURE, "better mixture", 2), (NEW_STRATEGY, "new", 1))
+    branches = (
+        (MIXTURE, "decision: mixture", 0),
+        (BETTER_MIXTURE, "mixture, AIRL was worse", 2),
+        (NEW_STRATEGY, "new strategy", 1),
+    )
     for branch, label, k in branches:
         taken = [i for i, r in enumerate(records) if r["branch"] == branch]
         for i in taken:
-            name = f"taken: {label}" if i == taken[0] else None
+            name = label if i == taken[0] else None
             ax.axvspan(i - 0.5, i + 0.5, color=INKS[k], alpha=0.15, linewidth=0, zorder=0, label=name)
-    for name, key, k in (("best mixture", "kl_mix", 0), ("new policy", "kl_new", 1)):
+    for name, key, k in (("best mixture", "kl_mix", 0), ("AIRL's new policy", "kl_new", 1)):
         values = [np.nan if r[key] is None else max(r[key], 0.01) for r in records]
-        ax.plot(x, values, "oX"[k], color=INKS[k], label=name, linestyle="none")
-    ax.hlines(np.maximum(floor, 0.01), x - 0.4, x + 0.4, color="black", label="floor")
-    ax.plot(x, [r["threshold"] for r in records], color=INKS[3], label="threshold", drawstyle="steps-mid")
-    ticks = [f"{i}\n({r['n_strategies']})" for i, r in enumerate(records)]
-    ax.set(ylabel="KL (nats)", yscale="log", xticks=x, xticklabels=ticks)
-    ax.set_xlabel("demonstration, in order of arrival (strategies so far)")
+        ax.plot(x + 0.15 * (2 * k - 1), values, "oX"[k], color=INKS[k], label=name, linestyle="none")
+    ax.hlines(np.maximum(floor, 0.01), x - 0.4, x + 0.4, color="black", label="floor: the person again")
+    eps = [r["threshold"] for r in records]
+    ax.hlines(eps, x - 0.5, x + 0.5, color="black", linestyle=":", label=r"threshold $\epsilon$")
+    names = who or [str(i) for i in x]
+    ticks = [f"{name}\n({r['n_strategies']})" for name, r in zip(names, records, strict=True)]
+    ax.set(ylabel="KL (nats), lower is nearer", yscale="log", xticks=x, xticklabels=ticks)
+    ax.set_xlabel("who arrived (strategies so far)")
     ax.set_xlim(-0.5, len(records) - 0.5)
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter(ScalarFormatter())

@@ -91,12 +91,13 @@ def test_weights_are_stacked_to_one(ax):
 
 
 def test_decisions_and_streams_show_what_was_measured(ax):
-    figures.plot_decisions(RECORDS, FLOOR, ax)
+    figures.plot_decisions(RECORDS, FLOOR, ax, ["Ada", "Cleo", "Ben"])
     lines = {line.get_label(): np.asarray(line.get_ydata(), dtype=float) for line in ax.lines}
     assert lines["best mixture"] == pytest.approx([np.nan, 0.8, 3.0], nan_ok=True)
-    assert lines["new policy"] == pytest.approx([0.5, np.nan, 0.4], nan_ok=True)
-    assert lines["threshold"] == pytest.approx([1.0, 1.1, 0.9])
-    assert texts(ax.get_xticklabels()) == ["0\n(1)", "1\n(1)", "2\n(2)"]
+    assert lines["AIRL's new policy"] == pytest.approx([0.5, np.nan, 0.4], nan_ok=True)
+    bars = {bars.get_label(): [y for (_, y), _ in bars.get_segments()] for bars in ax.collections}
+    assert bars[r"threshold $\epsilon$"] == pytest.approx([1.0, 1.1, 0.9])
+    assert texts(ax.get_xticklabels()) == ["Ada\n(1)", "Cleo\n(1)", "Ben\n(2)"]
     figures.plot_stream(RECORDS, FLOOR, ax)
     points = {line.get_label(): (list(line.get_xdata()), list(line.get_ydata())) for line in ax.lines}
     assert points["new strategy (2)"] == ([0, 2], [0.5, 0.4])
