@@ -132,7 +132,6 @@ METHODS_FROM_NOTHING = {
             msrd=_round_from_nothing(name, usual.dmsrd.msrd),
             task_learns=True,
             own_rollouts={PENDULUM: 5, LANDER: 20}[name],  # AIRL would miss the steps; few do (lesson 05)
-            own_clones=True,  # its policies do not yet act much like their people
             policies_after_new=False,  # no cloning term would hold them near their demonstrations
             policies_after_mixture=False,
         ),
@@ -296,7 +295,7 @@ class DMSRDLesson:  # 06
         found["task_learns as printed, nothing"] = replace(nothing, task_learns=False)
         moving = replace(nothing, policies_after_new=True, policies_after_mixture=True)
         found["policies learn in rounds, nothing"] = moving
-        found["Equation 4 on explanations, nothing"] = replace(nothing, own_clones=False)
+        found["Equation 4 on clones, nothing"] = replace(nothing, own_clones=True)
         airl = replace(nothing.airl, anchor_samples=0)
         found["samples of AIRL's end alone, nothing"] = replace(nothing, airl=airl)
         return found | {"without BCD": replace(self.loop, between_class="never")}
