@@ -7,6 +7,8 @@ import torch
 
 from dmsrd_lite.domains import Domain
 from dmsrd_lite.domains.domain import Seed
+from dmsrd_lite.learning.networks import one_thread, to_tensor
+from dmsrd_lite.method.rewards import Rewards
 
 N_STATES = 3000  # of each person, on which Equation 4 is asked
 
@@ -39,6 +41,33 @@ def relative_to_own(mean_rewards: torch.Tensor, pure: torch.Tensor) -> torch.Ten
     until both of its terms vanish.
     """
     return mean_rewards - mean_rewards.gather(1, pure[:, None])
+
+
+@one_thread()
+def train_rewards(
+    rewards: Rewards,
+    states: np.ndarray,
+    weights: np.ndarray,
+    pure: Sequence[int],
+    seed: Seed,
+    n_updates: int = 400,
+    rate: float = 3e-3,
+    batch: int = 128,
+) -> None:
+    """Updates of the strategy rewards by Equation 4 alone, counted from the own demonstration, in place.
+
+    states (n, n_states, obs_dim) of all n people (``states_of``), ``batch`` of each per update; weights (n,
+    M), pure (M,).
+    """
+    x, w = to_tensor(rewards.domain.network_input(states)), to_tensor(weights)
+    optimizer = torch.optim.Adam(rewards.strategy_reward.parameters(), rate)
+    for some in np.random.default_rng(seed).integers(0, x.shape[1], (n_updates, batch)):
+        seen = x[:, some].reshape(1, -1, x.shape[-1]).expand(len(pure), -1, -1)
+        means = rewards.g(seen).view(len(pure), len(x), -1).mean(2)  # (M, n)
+        own = torch.as_tensor(pure)
+        optimizer.zero_grad()
+        between_class_loss(relative_to_own(means, own), w, own).sum().backward()
+        optimizer.step()
 
 
 def recognized(mean_rewards: np.ndarray, pure: Sequence[int] | np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from dmsrd_lite.method.between_class_discrimination import (
     recognized,
     relative_to_own,
     states_of,
+    train_rewards,
 )
 from dmsrd_lite.method.rewards import Rewards
 
@@ -121,3 +122,20 @@ def test_states_that_are_everybodys_do_not_count():
     rewards = Rewards(LUNAR_LANDER, 2, 0.99, 0)
     by_hand = rewards.evaluate(observations)[..., :4].mean((2, 3))
     assert np.allclose(rewards.mean_rewards(shown), by_hand, atol=1e-6)
+
+
+def test_equation_4_alone_makes_ratios_the_weights():
+    """Three people who stand apart, one of them half of each of the others; the task reward rests."""
+    states = np.zeros((3, 50, 4))
+    states[..., 0] = np.array([-1.0, 1.0, 0.0])[:, None] + np.random.default_rng(0).normal(0, 0.02, (3, 50))
+    weights, pure = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5]]), (0, 1)
+    rewards = Rewards(INVERTED_PENDULUM, 2, 0.99, 0, 0.3)
+    task = rewards.task_reward.state_dict()["weights.0"].clone()
+    train_rewards(rewards, states, weights, pure, 0)
+    means = rewards.evaluate(states).mean(-1)  # (M, n)
+    ratios = np.exp(means - means[[0, 1], [0, 1]][:, None])
+    assert np.abs(ratios.T - weights).max() < 0.1
+    assert torch.equal(rewards.task_reward.state_dict()["weights.0"], task)
+    again = Rewards(INVERTED_PENDULUM, 2, 0.99, 0, 0.3)
+    train_rewards(again, states, weights, pure, 0)
+    assert np.array_equal(again.evaluate(states).mean(-1), means)
