@@ -85,6 +85,13 @@ def _numbers(record: dict, domain: Domain) -> Iterator[tuple[str, str, Any]]:
             for budget, scores in by_budget.items():
                 yield from _scores(f"{method}, {int(budget) / 1e6:g} M steps", scores, domain, *known)
         return
+    if "recognition" in r:  # lesson 06
+        most = record["settings"]["n_fresh"][-1]
+        for run, by_source in r["recognition"].items():
+            for source, count in by_source.items():
+                if source != "of":
+                    yield f"ours, {run}: {source}", f"recognized_on_{most}", count / by_source["of"]
+        return
     if "lived" in r:  # lesson 08, a thousand users: one row each
         yield "ours, a thousand users", "strategies", len(r["pure"])
         yield "ours, a thousand users", "pearson", r["looks"][-1]["pearson"]
@@ -109,7 +116,8 @@ def _numbers(record: dict, domain: Domain) -> Iterator[tuple[str, str, Any]]:
     for method, scores in r.get("table", {}).items():
         yield from _scores(method, scores, domain, floor, own)
     for name, scores in r.get("ablations", {}).items():
-        yield from _scores(f"ours, clone: {name}", scores, domain, floor, own)
+        start = "" if name.endswith("nothing") else ", clone"
+        yield from _scores(f"ours{start}: {name}", scores, domain, floor, own)
     for name, scores in r.get("variants", {}).items():
         yield from _scores(f"variant: {name}", scores, domain, floor[few], own[few])
     for name, scores in {**r.get("worth", {}), **r.get("ingredients", {})}.items():

@@ -68,6 +68,15 @@ def test_what_follows_from_a_row_by_hand():
     assert ("AIRL", "curve") not in found
 
 
+def test_what_would_help_recognition_is_a_share():
+    row = {"recognition": {"clone, run 0": {"as recorded": 6, "clones": 8, "of": 8}}}
+    record = {"results": row, "settings": {"n_fresh": [3, 30]}}
+    assert [*results._numbers(record, DOMAINS["inverted_pendulum"])] == [
+        ("ours, clone, run 0: as recorded", "recognized_on_30", 0.75),
+        ("ours, clone, run 0: clones", "recognized_on_30", 1.0),
+    ]
+
+
 def test_searches_and_recognition_by_hand():
     row = {"known": 2, "search": "random", "budget": 96, "above_floor": 0.5, "error": 0.1, "steps": 100.0}
     early, free = (
