@@ -44,7 +44,7 @@ def of(pattern):
 
 
 FROM_NOTHING = of("0[23]")
-FORMS = [name for name in of("06") if "ablations" not in name]
+FORMS = [name for name in of("06") if "_clone_" in name or "_nothing_" in name]
 
 
 def restored(name, method):
