@@ -43,6 +43,15 @@ def relative_to_own(mean_rewards: torch.Tensor, pure: torch.Tensor) -> torch.Ten
     return mean_rewards - mean_rewards.gather(1, pure[:, None])
 
 
+def means_of_people(rewards: Rewards, states: torch.Tensor) -> torch.Tensor:
+    """``eta_S-j(tau_i)``, the mean of g_j over states of each of n people: network inputs (n, k, obs_dim) ->
+    (M, n)."""
+    m = rewards.strategy_reward.n_strategies
+    return (
+        rewards.g(states.reshape(1, -1, states.shape[-1]).expand(m, -1, -1)).view(m, len(states), -1).mean(2)
+    )
+
+
 @one_thread()
 def train_rewards(
     rewards: Rewards,
@@ -60,13 +69,12 @@ def train_rewards(
     M), pure (M,).
     """
     x, w = to_tensor(rewards.domain.network_input(states)), to_tensor(weights)
+    own = torch.as_tensor(pure)
     optimizer = torch.optim.Adam(rewards.strategy_reward.parameters(), rate)
     for some in np.random.default_rng(seed).integers(0, x.shape[1], (n_updates, batch)):
-        seen = x[:, some].reshape(1, -1, x.shape[-1]).expand(len(pure), -1, -1)
-        means = rewards.g(seen).view(len(pure), len(x), -1).mean(2)  # (M, n)
-        own = torch.as_tensor(pure)
+        means = relative_to_own(means_of_people(rewards, x[:, some]), own)
         optimizer.zero_grad()
-        between_class_loss(relative_to_own(means, own), w, own).sum().backward()
+        between_class_loss(means, w, own).sum().backward()
         optimizer.step()
 
 

@@ -17,7 +17,11 @@ from dmsrd_lite.domains import InputError
 from dmsrd_lite.domains.domain import Seed
 from dmsrd_lite.learning.networks import to_tensor
 from dmsrd_lite.method.airl import AIRL, AIRLSettings
-from dmsrd_lite.method.between_class_discrimination import between_class_loss, relative_to_own
+from dmsrd_lite.method.between_class_discrimination import (
+    between_class_loss,
+    means_of_people,
+    relative_to_own,
+)
 
 Between = tuple[
     np.ndarray, np.ndarray, Sequence[int] | np.ndarray
@@ -69,8 +73,7 @@ class MSRD(AIRL):
         if self.between is not None:
             x, weights, pure = self.between
             some = torch.from_numpy(rng.integers(0, x.shape[1], self.settings.between_class_batch))
-            states = x[:, some].reshape(1, -1, x.shape[-1]).expand(len(pure), -1, -1)
-            mean_rewards = self.rewards.g(states).view(len(pure), len(x), -1).mean(2)  # (M, n)
+            mean_rewards = means_of_people(self.rewards, x[:, some])
             if self.settings.between_class_relative:
                 mean_rewards = relative_to_own(mean_rewards, pure)
             loss = (

@@ -91,7 +91,6 @@ def inside_bounds(actor: Actor, demonstration: DemonstrationSet) -> tuple[np.nda
 
 
 @one_thread()
-@one_thread()
 def likeliest_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
     """The mixture under which one demonstrator's actions are the most likely: weights (M,), without a
     rollout.

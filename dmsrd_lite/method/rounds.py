@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dmsrd_lite.learning.networks import Policies
 from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method.airl import clone_demonstrations
 from dmsrd_lite.method.between_class_discrimination import states_of
@@ -79,9 +80,11 @@ def _states(
     demonstration acts instead: from nothing an explanation need not act much like its person.
     """
     if settings.own_rollouts:
-        shown, steps = state.shown.select(some), settings.airl.cloning_steps
-        clones = settings.own_clones and clone_demonstrations(shown, [*seed, 2], steps)[0].actor()
-        data = rollout(state.domain, clones or state.mixtures(some), settings.own_rollouts, [*seed, 0])
+        actor: Policies = state.mixtures(some)
+        if settings.own_clones:
+            shown, n_steps = state.shown.select(some), settings.airl.cloning_steps
+            actor = clone_demonstrations(shown, [*seed, 2], n_steps)[0].actor()
+        data = rollout(state.domain, actor, settings.own_rollouts, [*seed, 0])
         observations, steps = data.observations, data.n_steps
     else:
         observations, steps = state.shown.select(some).observations, 0
