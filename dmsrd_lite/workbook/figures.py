@@ -204,7 +204,8 @@ def plot_decisions(
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter(ScalarFormatter())
     ax.yaxis.set_minor_formatter(NullFormatter())
-    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, fontsize=8)
+    columns = 4 if len(records) > 8 else 2  # a wide legend would squeeze a narrow figure
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, fontsize=8)
     return ax
 
 
