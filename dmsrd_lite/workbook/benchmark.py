@@ -253,6 +253,25 @@ def fisher(found: Benchmark, entries: Sequence[Entry], n: int) -> pd.DataFrame:
     return pd.DataFrame(lines).T.round(1)
 
 
+def teaching(found: Benchmark, entries: Sequence[Entry], controls: dict[int, Any]) -> pd.DataFrame:
+    """How many fresh policies do the task after training on each frozen reward, and the mean return of all;
+    ``controls``: by trial the same of a reward that was fitted to true returns, or None."""
+    rows = {f"{m}, {start}": found.per_trial(m, start, budget) for m, start, budget in entries}
+    tried = {k: [row.get("worth") for row in some] for k, some in rows.items()}
+    tried["control"] = [controls.get(trial) for trial in sorted(found.known)]
+    table = {}
+    for name, of_trials in tried.items():
+        line = {}
+        for trial, one in zip(sorted(found.known), of_trials, strict=True):
+            if one:
+                count = int(able(found.domain, one).sum())
+                line[f"trial {trial}"] = f"{count} of {len(one['environment_return'])}"
+        if line:
+            returns = np.concatenate([one["environment_return"] for one in of_trials if one])
+            table[name] = {**line, "return": f"{returns.mean():.1f}"}
+    return pd.DataFrame(table).T.fillna("")
+
+
 def recognition(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     """The share of strategy rewards that rank their own person first, by the takes they are asked on."""
     table = {}
@@ -303,6 +322,32 @@ def newcomers(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     return pd.concat([people, table.groupby(["run", "explained"]).mean(numeric_only=True)], axis=1).round(2)
 
 
+def _with_interval(gap: tuple[float, float, float]) -> str:
+    return f"{gap[0]:+.2f} [{gap[1]:+.2f}, {gap[2]:+.2f}]"
+
+
+def _of_newcomers(
+    found: Benchmark, entry: Entry, alone: Entry
+) -> Iterator[tuple[str, str, list[float], bool]]:
+    """Claims 6 and 8, person by person against AIRL Single: number, claim, differences, and is more better;
+    steps are those of the decision, search and AIRL, in millions."""
+    does, mixed, everybody = [], [], []
+    for row, other in zip(found.per_trial(*entry), found.per_trial(*alone), strict=True):
+        can = np.subtract(able(found.domain, row), able(found.domain, other), dtype=float)
+        for i, r in enumerate(row["decisions"]):
+            steps = (r["steps"]["search"] + r["steps"]["airl"] - other["spent"]) / 1e6
+            everybody.append(steps)
+            does += [can[i]] if i not in row["pure"] else []
+            mixed += [steps] if r["steps"]["airl"] == 0 else []
+    for number, claim, gaps, larger in (
+        ("6", "who is explained by a mixture does the task", does, True),
+        ("8", "who needs no AIRL costs fewer million steps", mixed, False),
+        ("8", "a new user costs fewer million steps", everybody, False),
+    ):
+        if len(gaps) > 2:  # fewer are no evidence
+            yield number, claim, gaps, larger
+
+
 def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:
     """The paper's claims that can be tested here, from the records; ``most`` fresh takes for claim 4."""
 
@@ -329,7 +374,8 @@ def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFr
             rival = best_rival(start, budget, metric)
             gap = found.difference(entry, rival, metric)
             shared = [b for b in found.budgets(method, start) if b in found.budgets(RIVALS[0], start)]
-            numbers = f"{gap[0]:+.2f} [{gap[1]:+.2f}, {gap[2]:+.2f}] against {rival[0]}"
+            share = gap[0] / abs(found.values(*rival, metric).mean())
+            numbers = f"{_with_interval(gap)} against {rival[0]} ({share:+.0%})"
             over = first_budget(told, shared)
             lines.append([number, f"{method}, {start}", f"better {title}", told(budget), numbers, over])
         for number, claim, other, value in (
@@ -345,5 +391,10 @@ def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFr
                 numbers = ", ".join(f"{gap:+.3f}" for gap in gaps) + f" against {other}"
                 told_by_trials = verdict((0.0, min(gaps), max(gaps)), True)
                 lines.append([number, f"{method}, {start}", claim, told_by_trials, numbers, ""])
+        if "AIRL Single" in there:
+            for number, claim, gaps, larger in _of_newcomers(found, entry, there["AIRL Single"]):
+                gap = float(np.mean(gaps)), *mean_interval(np.array(gaps))
+                numbers = f"{_with_interval(gap)} against AIRL Single"
+                lines.append([number, f"{method}, {start}", claim, verdict(gap, larger), numbers, ""])
     header = ["claim", "method", "says", "verdict", "difference", "over the budget"]
     return pd.DataFrame(lines, columns=header).set_index("claim")

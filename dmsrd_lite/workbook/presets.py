@@ -330,6 +330,11 @@ class BenchmarkLesson:  # 07
     nothing: MethodSettings
     n_fresh: tuple[int, ...] = (3, 10, 30)
 
+    @property
+    def fresh(self) -> TrainingSettings:
+        """Of policies on a frozen task reward."""
+        return _fresh(self.domain)
+
     def trained_for(self, method: str, start: str) -> tuple[int, ...]:
         """The budgets that ask for a training of their own."""
         if start == "clone":

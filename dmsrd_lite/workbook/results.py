@@ -135,6 +135,8 @@ def _scores(
             yield from (
                 (method, f"recognized_on_{take}", n / len(scores["pure"])) for take, n in value.items()
             )
+        elif metric == "worth":  # lesson 07
+            yield from _scores(f"fresh policies on: {method}", value, domain, None, None)
         elif metric not in NO_METRICS:
             yield method, metric, value
     yield method, "able", able(domain, scores)

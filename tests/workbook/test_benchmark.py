@@ -49,6 +49,20 @@ def test_values_follow_trials_and_demonstrations():
     assert table.loc["DMSRD, nothing", "million steps each"] == "0.50"
 
 
+def test_what_frozen_rewards_teach():
+    held, fell = {"environment_return": [-9.0, -9.0], "failure_share": [0, 0]}, -1e6
+    worth = [held, {"environment_return": [-9.0, fell], "failure_share": [0, 1]}]
+    trials = [(k, trial((-3.0, -2.0))) for k in (0, 1)]
+    for (_, one), found in zip(trials, worth, strict=True):
+        one["scores"]["DMSRD, nothing"]["500000"]["worth"] = found
+    found = benchmark.collect(INVERTED_PENDULUM, iter(trials))
+    entries = [("DMSRD", "nothing", 500_000), ("DMSRD", "nothing", 250_000)]
+    table = benchmark.teaching(found, entries[:1], {0: None, 1: held})
+    assert table.loc["DMSRD, nothing"].tolist() == ["2 of 2", "1 of 2", f"{(3 * -9.0 + fell) / 4:.1f}"]
+    assert table.loc["control"].tolist() == ["", "2 of 2", "-9.0"]
+    assert benchmark.teaching(found, entries[1:], {}).empty
+
+
 def test_a_budget_that_no_record_holds():
     with pytest.raises(InputError, match=r"^DMSRD from nothing was not scored at 100,000 steps per demonstr"):
         everything().per_trial("DMSRD", "nothing", 100_000)
@@ -100,6 +114,29 @@ def test_records_are_read_whole_or_not_at_all(tmp_path):
 )
 def test_a_verdict_asks_for_the_whole_interval(difference, larger, expected):
     assert benchmark.verdict(difference, larger) == expected
+
+
+def test_what_newcomers_cost_and_whether_their_mixtures_do_the_task():
+    """Of two trials with two people each, three are mixtures; one of them does a task that AIRL does not."""
+    steps = [{"search": 100_000, "airl": a} for a in (400_000, 0, 0, 500_000)]
+    trials = []
+    for k in (0, 1):
+        one = trial((-9.0, -9.0))
+        decided = {"decisions": [{"steps": x, "branch": ""} for x in steps[2 * k : 2 * k + 2]]}
+        one["scores"]["DMSRD, nothing"]["500000"] |= {"pure": [0] if k == 0 else [], **decided}
+        returns = (-9.0, -9.0 if k else -1e6)
+        one["scores"]["AIRL Single, nothing"] = {"500000": row(list(returns))}
+        trials.append((k, one))
+    found = benchmark.collect(INVERTED_PENDULUM, iter(trials))
+    pair = [(method, "nothing", 500_000) for method in ("DMSRD", "AIRL Single")]
+    told = {claim: (number, gaps) for number, claim, gaps, _ in benchmark._of_newcomers(found, *pair)}
+    assert told["who is explained by a mixture does the task"] == ("6", [1, 0, 0])
+    number, gaps = told["a new user costs fewer million steps"]
+    assert (number, gaps) == ("8", pytest.approx([0, -0.4, -0.4, 0.1]))
+    assert len(told) == 2  # two people needed no AIRL: too few for a line
+    table = benchmark.verdicts(found, pair, 30)
+    assert table.loc["8", "verdict"] == "a tie"
+    assert table.loc["6", "difference"].startswith("+0.33 [+0.00, ")
 
 
 def test_a_verdict_over_the_budget():
