@@ -374,8 +374,9 @@ def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFr
             rival = best_rival(start, budget, metric)
             gap = found.difference(entry, rival, metric)
             shared = [b for b in found.budgets(method, start) if b in found.budgets(RIVALS[0], start)]
-            share = gap[0] / abs(found.values(*rival, metric).mean())
-            numbers = f"{_with_interval(gap)} against {rival[0]} ({share:+.0%})"
+            numbers = f"{_with_interval(gap)} against {rival[0]}"
+            if number == "1":  # of a likelihood a share means nothing: its zero depends on units
+                numbers += f" ({gap[0] / abs(found.values(*rival, metric).mean()):+.0%})"
             over = first_budget(told, shared)
             lines.append([number, f"{method}, {start}", f"better {title}", told(budget), numbers, over])
         for number, claim, other, value in (
