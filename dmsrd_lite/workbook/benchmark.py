@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
 from dmsrd_lite.domains import Domain, InputError
 from dmsrd_lite.evaluation.statistics import Ranks, compare_correlations, mean_interval, rank_methods
@@ -79,13 +80,20 @@ class Benchmark:
         return np.concatenate([row[metric] for row in self.per_trial(method, start, budget)]).astype(float)
 
     def difference(self, one: Entry, other: Entry, metric: str) -> tuple[float, float, float]:
-        """Mean of one method's minus another's, demonstration by demonstration, and its 95 % interval."""
-        gap = self.values(*one, metric) - self.values(*other, metric)
-        return float(gap.mean()), *mean_interval(gap)
+        """Mean of one method's minus another's and its 95 % interval (``over_people``)."""
+        people = [person for trial in sorted(self.known) for person in self.known[trial]["arrival"]]
+        return over_people(self.values(*one, metric) - self.values(*other, metric), people)
 
     def over_trials(self, entry: Entry, value: Callable[[dict[str, Any]], float]) -> list[float]:
         """A number for each trial."""
         return [float(value(row)) for row in self.per_trial(*entry)]
+
+
+def over_people(values: ArrayLike, people: Sequence[int]) -> tuple[float, float, float]:
+    """Mean and 95 % bootstrap interval over people; what one person has in several trials is averaged first:
+    it is not independent."""
+    each = pd.Series(values, dtype=float).groupby(list(people)).mean().to_numpy()
+    return float(each.mean()), *mean_interval(each)
 
 
 def in_words(values: np.ndarray) -> str:
@@ -220,7 +228,7 @@ def friedman(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
         for k, (metric, (title, _)) in enumerate(METRICS.items()):
             result = ranks(found, three, metric)
             at = {e[0]: i for i, e in enumerate(three)}
-            p = {f"{m} - DMSRD": result.pairwise_p[at[m], at[OURS[0]]] for m in RIVALS}
+            p = {f"p: {m}, {OURS[0]}": result.pairwise_p[at[m], at[OURS[0]]] for m in RIVALS}
             told = {
                 "Q(2)": result.q,
                 "paper's Q": PAPER[found.domain.name]["Friedman's Q(2)"][k],
@@ -273,14 +281,14 @@ def teaching(found: Benchmark, entries: Sequence[Entry], controls: dict[int, Any
 
 
 def recognition(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
-    """The share of strategy rewards that rank their own person first, by the takes they are asked on."""
+    """How many strategy rewards rank their own person first, by the takes they are asked on; all trials."""
     table = {}
     for entry in entries:
         rows = found.per_trial(*entry)
         if "recognized_fresh" in rows[0]:
-            takes = rows[0]["recognized_fresh"]
-            shares = {k: np.mean([r["recognized_fresh"][k] / len(r["pure"]) for r in rows]) for k in takes}
-            table[f"{entry[0]}, {entry[1]}"] = {k: f"{share:.0%}" for k, share in shares.items()}
+            counts = {k: sum(r["recognized_fresh"][k] for r in rows) for k in rows[0]["recognized_fresh"]}
+            of = sum(len(r["pure"]) for r in rows)
+            table[f"{entry[0]}, {entry[1]}"] = {k: f"{n} of {of}" for k, n in counts.items()}
     return pd.DataFrame(table).T
 
 
@@ -322,34 +330,39 @@ def newcomers(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     return pd.concat([people, table.groupby(["run", "explained"]).mean(numeric_only=True)], axis=1).round(2)
 
 
-def _with_interval(gap: tuple[float, float, float]) -> str:
-    return f"{gap[0]:+.2f} [{gap[1]:+.2f}, {gap[2]:+.2f}]"
-
-
 def _of_newcomers(
     found: Benchmark, entry: Entry, alone: Entry
-) -> Iterator[tuple[str, str, list[float], bool]]:
-    """Claims 6 and 8, person by person against AIRL Single: number, claim, differences, and is more better;
+) -> Iterator[tuple[str, str, tuple[float, float, float], bool]]:
+    """Claims 6 and 8, person by person against AIRL Single: number, claim, difference, and is more better;
     steps are those of the decision, search and AIRL, in millions."""
-    does, mixed, everybody = [], [], []
-    for row, other in zip(found.per_trial(*entry), found.per_trial(*alone), strict=True):
-        can = np.subtract(able(found.domain, row), able(found.domain, other), dtype=float)
-        for i, r in enumerate(row["decisions"]):
+    does, mixed, everybody, n_able = [], [], [], 0
+    for trial, row, other in zip(
+        sorted(found.known), found.per_trial(*entry), found.per_trial(*alone), strict=True
+    ):
+        can, others = (able(found.domain, one).astype(float) for one in (row, other))
+        for i, (who, r) in enumerate(zip(found.known[trial]["arrival"], row["decisions"], strict=True)):
             steps = (r["steps"]["search"] + r["steps"]["airl"] - other["spent"]) / 1e6
-            everybody.append(steps)
-            does += [can[i]] if i not in row["pure"] else []
-            mixed += [steps] if r["steps"]["airl"] == 0 else []
+            everybody.append((steps, who))
+            if i not in row["pure"]:
+                does.append((can[i] - others[i], who))
+                n_able += int(can[i])
+            mixed += [(steps, who)] if r["steps"]["airl"] == 0 else []
     for number, claim, gaps, larger in (
-        ("6", "who is explained by a mixture does the task", does, True),
+        ("6", f"mixtures do the task ({n_able} of {len(does)})", does, True),
         ("8", "who needs no AIRL costs fewer million steps", mixed, False),
         ("8", "a new user costs fewer million steps", everybody, False),
     ):
-        if len(gaps) > 2:  # fewer are no evidence
-            yield number, claim, gaps, larger
+        values, people = zip(*gaps, strict=True) if gaps else ((), ())
+        if len(set(people)) > 2:  # fewer are no evidence
+            yield number, claim, over_people(values, people), larger
 
 
 def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:
-    """The paper's claims that can be tested here, from the records; ``most`` fresh takes for claim 4."""
+    """The paper's claims that can be tested here, from the records; ``most`` fresh takes for claim 4.
+
+    Of scores against the better of AIRL Single and MSRD (by the mean), and from a clone against cloning;
+    what BCD does only for ours, which differs from "without BCD" in nothing else.
+    """
 
     def known(row: dict[str, Any]) -> float:
         return row["recognized_fresh"][str(most)] / len(row["pure"])
@@ -359,26 +372,39 @@ def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFr
         rivals: list[Entry] = [(rival, start, budget) for rival in RIVALS]
         return max(rivals, key=lambda e: sign * found.values(e[0], e[1], e[2], metric).mean())
 
-    lines = []
+    lines: list[list[str]] = []
     for entry in (e for e in entries if e[0] in OURS):
         method, start, budget = entry
         there = {e[0]: e for e in entries if e[1] == start}
+
+        def add(
+            number: str, says: str, rival: str, gap: tuple[float, float, float], larger: bool, over: str = "",
+            name: str = f"{method}, {start}",
+        ) -> None:  # fmt: skip
+            numbers = f"{gap[0]:+.2f} [{gap[1]:+.2f}, {gap[2]:+.2f}]"
+            lines.append([number, name, says, rival, numbers, verdict(gap, larger), over])
+
         for number, (metric, (title, larger)) in zip("12-", METRICS.items(), strict=True):
-            if not set(RIVALS) <= set(there):
-                continue
+            if set(RIVALS) <= set(there):
 
-            def told(b: int, metric: str = metric, larger: bool = larger, e: Entry = entry) -> str:
-                other = best_rival(e[1], b, metric)
-                return verdict(found.difference((e[0], e[1], b), other, metric), larger)
+                def told(b: int, metric: str = metric, larger: bool = larger, e: Entry = entry) -> str:
+                    other = best_rival(e[1], b, metric)
+                    return verdict(found.difference((e[0], e[1], b), other, metric), larger)
 
-            rival = best_rival(start, budget, metric)
-            gap = found.difference(entry, rival, metric)
-            shared = [b for b in found.budgets(method, start) if b in found.budgets(RIVALS[0], start)]
-            numbers = f"{_with_interval(gap)} against {rival[0]}"
-            if number == "1":  # of a likelihood a share means nothing: its zero depends on units
-                numbers += f" ({gap[0] / abs(found.values(*rival, metric).mean()):+.0%})"
-            over = first_budget(told, shared)
-            lines.append([number, f"{method}, {start}", f"better {title}", told(budget), numbers, over])
+                rival = best_rival(start, budget, metric)
+                shared = [b for b in found.budgets(method, start) if b in found.budgets(RIVALS[0], start)]
+                gap, over = found.difference(entry, rival, metric), first_budget(told, shared)
+                add(number, f"better {title}", rival[0], gap, larger, over)
+                if number == "1":  # of a likelihood a share means nothing: its zero depends on units
+                    lines[-1][4] += f" ({gap[0] / abs(found.values(*rival, metric).mean()):+.0%})"
+            if "cloning" in there:
+                add(
+                    "-",
+                    f"better {title}",
+                    "cloning",
+                    found.difference(entry, there["cloning"], metric),
+                    larger,
+                )
         for number, claim, other, value in (
             ("3", "stronger correlation", "AIRL Batch", itemgetter("pearson")),
             ("3", "stronger correlation", "MSRD", itemgetter("pearson")),
@@ -386,16 +412,25 @@ def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFr
             ("4", "more strategies recognised", "DMSRD without BCD", known),
             ("5", "BCD: stronger correlation", "DMSRD without BCD", itemgetter("pearson")),
         ):
-            if other in there:
+            if other in there and not (other == "DMSRD without BCD" and method != "DMSRD"):
                 pairs = zip(*(found.over_trials(e, value) for e in (entry, there[other])), strict=True)
                 gaps = [a - b for a, b in pairs]
-                numbers = ", ".join(f"{gap:+.3f}" for gap in gaps) + f" against {other}"
-                told_by_trials = verdict((0.0, min(gaps), max(gaps)), True)
-                lines.append([number, f"{method}, {start}", claim, told_by_trials, numbers, ""])
+                add(number, claim, other, (0.0, min(gaps), max(gaps)), True)
+                lines[-1][4] = ", ".join(f"{gap:+.3f}" for gap in gaps)
         if "AIRL Single" in there:
-            for number, claim, gaps, larger in _of_newcomers(found, entry, there["AIRL Single"]):
-                gap = float(np.mean(gaps)), *mean_interval(np.array(gaps))
-                numbers = f"{_with_interval(gap)} against AIRL Single"
-                lines.append([number, f"{method}, {start}", claim, verdict(gap, larger), numbers, ""])
-    header = ["claim", "method", "says", "verdict", "difference", "over the budget"]
+            for number, claim, gap, larger in _of_newcomers(found, entry, there["AIRL Single"]):
+                add(number, claim, "AIRL Single", gap, larger)
+    header = ["claim", "method", "says", "against", "difference", "verdict", "over the budget"]
     return pd.DataFrame(lines, columns=header).set_index("claim")
+
+
+def in_short(table: pd.DataFrame) -> str:
+    """What ``verdicts`` says, in a few lines for each method and start."""
+    text = []
+    for method, rows in table.groupby("method", sort=False):
+        text.append(f"{method}")
+        for told, some in rows.groupby("verdict", sort=False):
+            text.append(
+                f"    {told}: " + "; ".join(f"{a} ({b})" for a, b in some[["says", "against"]].values)
+            )
+    return "\n".join(text)

@@ -121,7 +121,7 @@ def test_what_newcomers_cost_and_whether_their_mixtures_do_the_task():
     steps = [{"search": 100_000, "airl": a} for a in (400_000, 0, 0, 500_000)]
     trials = []
     for k in (0, 1):
-        one = trial((-9.0, -9.0))
+        one = trial((-9.0, -9.0), arrival=(2 * k, 2 * k + 1))
         decided = {"decisions": [{"steps": x, "branch": ""} for x in steps[2 * k : 2 * k + 2]]}
         one["scores"]["DMSRD, nothing"]["500000"] |= {"pure": [0] if k == 0 else [], **decided}
         returns = (-9.0, -9.0 if k else -1e6)
@@ -130,13 +130,22 @@ def test_what_newcomers_cost_and_whether_their_mixtures_do_the_task():
     found = benchmark.collect(INVERTED_PENDULUM, iter(trials))
     pair = [(method, "nothing", 500_000) for method in ("DMSRD", "AIRL Single")]
     told = {claim: (number, gaps) for number, claim, gaps, _ in benchmark._of_newcomers(found, *pair)}
-    assert told["who is explained by a mixture does the task"] == ("6", [1, 0, 0])
-    number, gaps = told["a new user costs fewer million steps"]
-    assert (number, gaps) == ("8", pytest.approx([0, -0.4, -0.4, 0.1]))
+    assert told["mixtures do the task (3 of 3)"] == ("6", (pytest.approx(1 / 3), 0, 1))
+    number, (mean, low, high) = told["a new user costs fewer million steps"]
+    assert (number, mean) == ("8", pytest.approx(np.mean([0, -0.4, -0.4, 0.1])))
+    assert low < mean < high
     assert len(told) == 2  # two people needed no AIRL: too few for a line
     table = benchmark.verdicts(found, pair, 30)
     assert table.loc["8", "verdict"] == "a tie"
     assert table.loc["6", "difference"].startswith("+0.33 [+0.00, ")
+    assert "    a tie: mixtures do the task (3 of 3) (AIRL Single); a new" in benchmark.in_short(table)
+
+
+def test_an_interval_is_over_people():
+    """Two trials of the same two people are two independent numbers, not four."""
+    mean, low, high = benchmark.over_people([1.0, 3.0, 3.0, 1.0], [0, 1, 1, 0])
+    assert (mean, low, high) == (2, 1, 3)
+    assert benchmark.over_people([1.0, 3.0, 3.0, 1.0], [0, 1, 0, 1]) == (2, 2, 2)
 
 
 def test_a_verdict_over_the_budget():
