@@ -76,6 +76,11 @@ SHIPPED = str(DATA_FOLDER / "inverted_pendulum_demonstrations.npz")
             "part 'all': expected one of trial, ablations, orders, thousand",
         ),
         ("08_lifelong_100", {"users": 7, "record": True}, "record=True with users: expected users=0"),
+        (
+            "08_lifelong_100",
+            {"part": "orders", "form": "as printed"},
+            "part 'orders' with form 'as printed': expected ours",
+        ),
     ],
 )
 def test_a_bad_parameter_ends_the_lesson_at_its_start(name, parameters, sentence, tmp_path, monkeypatch):
