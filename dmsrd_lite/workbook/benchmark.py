@@ -431,6 +431,7 @@ def in_short(table: pd.DataFrame) -> str:
         text.append(f"{method}")
         for told, some in rows.groupby("verdict", sort=False):
             text.append(
-                f"    {told}: " + "; ".join(f"{a} ({b})" for a, b in some[["says", "against"]].values)
+                f"    {told} ({len(some)}): "
+                + "; ".join(f"{a} ({b})" for a, b in some[["says", "against"]].values)
             )
     return "\n".join(text)

@@ -138,7 +138,7 @@ def test_what_newcomers_cost_and_whether_their_mixtures_do_the_task():
     table = benchmark.verdicts(found, pair, 30)
     assert table.loc["8", "verdict"] == "a tie"
     assert table.loc["6", "difference"].startswith("+0.33 [+0.00, ")
-    assert "    a tie: mixtures do the task (3 of 3) (AIRL Single); a new" in benchmark.in_short(table)
+    assert "    a tie (2): mixtures do the task (3 of 3) (AIRL Single); a new" in benchmark.in_short(table)
 
 
 def test_an_interval_is_over_people():
