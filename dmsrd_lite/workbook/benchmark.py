@@ -357,69 +357,76 @@ def _of_newcomers(
             yield number, claim, over_people(values, people), larger
 
 
-def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:
-    """The paper's claims that can be tested here, from the records; ``most`` fresh takes for claim 4.
+def best_rival(found: Benchmark, start: str, budget: int, metric: str) -> Entry:
+    """AIRL Single or MSRD, whichever is better by the mean, as in the paper."""
+    sign = 1 if METRICS[metric][1] else -1
+    rivals: list[Entry] = [(rival, start, budget) for rival in RIVALS]
+    return max(rivals, key=lambda e: sign * found.values(e[0], e[1], e[2], metric).mean())
 
-    Of scores against the better of AIRL Single and MSRD (by the mean), and from a clone against cloning;
-    what BCD does only for ours, which differs from "without BCD" in nothing else.
-    """
+
+def _with_interval(gap: tuple[float, float, float]) -> str:
+    return f"{gap[0]:+.2f} [{gap[1]:+.2f}, {gap[2]:+.2f}]"
+
+
+def _of_scores(found: Benchmark, entry: Entry, there: dict[str, Entry]) -> Iterator[tuple[str, ...]]:
+    """Claims 1 and 2 and the KL, against the better rival; from a clone against cloning, too."""
+    method, start, budget = entry
+    shared = [b for b in found.budgets(method, start) if b in found.budgets(RIVALS[0], start)]
+    for number, (metric, (title, larger)) in zip("12-", METRICS.items(), strict=True):
+
+        def gap_to_best(b: int, metric: str = metric) -> tuple[float, float, float]:
+            return found.difference((method, start, b), best_rival(found, start, b, metric), metric)
+
+        def told(b: int, gap: Callable = gap_to_best, larger: bool = larger) -> str:
+            return verdict(gap(b), larger)
+
+        if set(RIVALS) <= set(there):
+            gap, rival = gap_to_best(budget), best_rival(found, start, budget, metric)
+            numbers = _with_interval(gap)
+            if number == "1":  # of a likelihood a share means nothing: its zero depends on units
+                numbers += f" ({gap[0] / abs(found.values(*rival, metric).mean()):+.0%})"
+            over = first_budget(told, shared)
+            yield number, f"better {title}", rival[0], numbers, verdict(gap, larger), over
+        if "cloning" in there:
+            gap = found.difference(entry, there["cloning"], metric)
+            yield "-", f"better {title}", "cloning", _with_interval(gap), verdict(gap, larger), ""
+
+
+def _of_rewards(
+    found: Benchmark, entry: Entry, there: dict[str, Entry], most: int
+) -> Iterator[tuple[str, ...]]:
+    """Claims 3, 4 and 5, trial by trial; what BCD does only of ours, which has a twin without it."""
 
     def known(row: dict[str, Any]) -> float:
         return row["recognized_fresh"][str(most)] / len(row["pure"])
 
-    def best_rival(start: str, budget: int, metric: str) -> Entry:
-        sign = 1 if METRICS[metric][1] else -1
-        rivals: list[Entry] = [(rival, start, budget) for rival in RIVALS]
-        return max(rivals, key=lambda e: sign * found.values(e[0], e[1], e[2], metric).mean())
+    correlation, twin = itemgetter("pearson"), "DMSRD without BCD"
+    claims: list[tuple[str, str, str, Callable]] = [
+        ("3", "stronger correlation", "AIRL Batch", correlation),
+        ("3", "stronger correlation", "MSRD", correlation),
+        ("4", "more strategies recognised", "MSRD", known),
+    ]
+    if entry[0] == "DMSRD":
+        claims.append(("4", "more strategies recognised", twin, known))
+        claims.append(("5", "BCD: stronger correlation", twin, correlation))
+    for number, says, rival, value in claims:
+        if rival in there:
+            pairs = zip(*(found.over_trials(e, value) for e in (entry, there[rival])), strict=True)
+            gaps = [a - b for a, b in pairs]
+            numbers = ", ".join(f"{gap:+.3f}" for gap in gaps)
+            yield number, says, rival, numbers, verdict((0.0, min(gaps), max(gaps)), True), ""
 
-    lines: list[list[str]] = []
+
+def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:
+    """The paper's claims that can be tested here, from the records; ``most`` fresh takes for claim 4."""
+    lines: list[tuple[str, ...]] = []
     for entry in (e for e in entries if e[0] in OURS):
-        method, start, budget = entry
-        there = {e[0]: e for e in entries if e[1] == start}
-
-        def add(
-            number: str, says: str, rival: str, gap: tuple[float, float, float], larger: bool, over: str = "",
-            name: str = f"{method}, {start}",
-        ) -> None:  # fmt: skip
-            numbers = f"{gap[0]:+.2f} [{gap[1]:+.2f}, {gap[2]:+.2f}]"
-            lines.append([number, name, says, rival, numbers, verdict(gap, larger), over])
-
-        for number, (metric, (title, larger)) in zip("12-", METRICS.items(), strict=True):
-            if set(RIVALS) <= set(there):
-
-                def told(b: int, metric: str = metric, larger: bool = larger, e: Entry = entry) -> str:
-                    other = best_rival(e[1], b, metric)
-                    return verdict(found.difference((e[0], e[1], b), other, metric), larger)
-
-                rival = best_rival(start, budget, metric)
-                shared = [b for b in found.budgets(method, start) if b in found.budgets(RIVALS[0], start)]
-                gap, over = found.difference(entry, rival, metric), first_budget(told, shared)
-                add(number, f"better {title}", rival[0], gap, larger, over)
-                if number == "1":  # of a likelihood a share means nothing: its zero depends on units
-                    lines[-1][4] += f" ({gap[0] / abs(found.values(*rival, metric).mean()):+.0%})"
-            if "cloning" in there:
-                add(
-                    "-",
-                    f"better {title}",
-                    "cloning",
-                    found.difference(entry, there["cloning"], metric),
-                    larger,
-                )
-        for number, claim, other, value in (
-            ("3", "stronger correlation", "AIRL Batch", itemgetter("pearson")),
-            ("3", "stronger correlation", "MSRD", itemgetter("pearson")),
-            ("4", "more strategies recognised", "MSRD", known),
-            ("4", "more strategies recognised", "DMSRD without BCD", known),
-            ("5", "BCD: stronger correlation", "DMSRD without BCD", itemgetter("pearson")),
-        ):
-            if other in there and not (other == "DMSRD without BCD" and method != "DMSRD"):
-                pairs = zip(*(found.over_trials(e, value) for e in (entry, there[other])), strict=True)
-                gaps = [a - b for a, b in pairs]
-                add(number, claim, other, (0.0, min(gaps), max(gaps)), True)
-                lines[-1][4] = ", ".join(f"{gap:+.3f}" for gap in gaps)
+        there = {e[0]: e for e in entries if e[1] == entry[1]}
+        told = [*_of_scores(found, entry, there), *_of_rewards(found, entry, there, most)]
         if "AIRL Single" in there:
-            for number, claim, gap, larger in _of_newcomers(found, entry, there["AIRL Single"]):
-                add(number, claim, "AIRL Single", gap, larger)
+            for number, says, gap, larger in _of_newcomers(found, entry, there["AIRL Single"]):
+                told.append((number, says, "AIRL Single", _with_interval(gap), verdict(gap, larger), ""))
+        lines += [(number, f"{entry[0]}, {entry[1]}", *rest) for number, *rest in told]
     header = ["claim", "method", "says", "against", "difference", "verdict", "over the budget"]
     return pd.DataFrame(lines, columns=header).set_index("claim")
 
