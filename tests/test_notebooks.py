@@ -81,6 +81,8 @@ SHIPPED = str(DATA_FOLDER / "inverted_pendulum_demonstrations.npz")
             {"part": "orders", "form": "as printed"},
             "part 'orders' with form 'as printed': expected ours",
         ),
+        ("08_lifelong_100", {"part": "orders"}, "part 'orders' with quick: expected preset full"),
+        ("07_benchmark", {"record": True}, "record=True without part: expected one"),
     ],
 )
 def test_a_bad_parameter_ends_the_lesson_at_its_start(name, parameters, sentence, tmp_path, monkeypatch):

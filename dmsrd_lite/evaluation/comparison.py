@@ -84,10 +84,12 @@ def train_to(
     budgets: Sequence[int] = (),
     progress: Callable = iter,
 ) -> Iterator[tuple[int, Learned]]:
-    """One training: what is known when each of ``budgets`` (ascending; environment steps per demonstration)
-    is spent, and in the end, each with the steps per demonstration so far.
+    """What is known after each of ``budgets`` (ascending; environment steps per demonstration) that is below
+    the settings' own, and in the end, each with the steps per demonstration.
 
-    Copies: training goes on after them. DMSRD and cloning are known in the end only.
+    One training, and copies of it that end: with a budget's settings, whose learning rate falls over its
+    second half (``last_rate``), a training is the same to the bit until half of it is spent. DMSRD and
+    cloning are known in the end only.
     """
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}: expected one of {', '.join(METHODS)}")
@@ -115,20 +117,28 @@ def train_to(
         clone = AIRL(shown, only_clone, seed).policies
         yield 0, Learned(clone, weights, seconds=time.perf_counter() - start)
         return
+    per_person = len(learner.x) / n  # steps for each demonstration in one of a strategy's
+    limit, alike = learner.settings.max_steps, 0.5 if learner.settings.last_rate < 1 else 1.0
+    left = [b for b in budgets if not limit or b < limit * per_person]
     curve: list[list[float]] = []
+    elsewhere = 0.0  # seconds: of copies, and of whoever looks at them
 
-    def known() -> tuple[int, Learned]:
-        models = copy.deepcopy((learner.learned_policies, learner.learned_rewards))
-        spent, seconds = learner.steps * len(learner.x), time.perf_counter() - start
-        return spent // n, Learned(models[0], weights, models[1], part, pure, spent, 0, seconds, [*curve])
+    def ended(one: AIRL, curve: list[list[float]], seconds: float) -> tuple[int, Learned]:
+        spent, models = one.steps * len(one.x), (one.learned_policies, one.learned_rewards)
+        return spent // n, Learned(models[0], weights, models[1], part, pure, spent, 0, seconds, curve)
 
-    left = list(budgets)
+    def line(record: dict) -> list[float]:
+        return [record["steps"], *(record["environment_return"] / record["horizon"]).round(4)]
+
     for r in progress(learner.train()):
-        curve.append([r["steps"], *(r["environment_return"] / r["horizon"]).round(4)])
-        if left and learner.steps * len(learner.x) >= left[0] * n:
-            left = [budget for budget in left if learner.steps * len(learner.x) < budget * n]
-            yield known()
-    yield known()
+        curve.append(line(r))
+        while left and learner.steps * per_person >= alike * left[0]:
+            begun, one = time.perf_counter(), copy.deepcopy(learner)
+            one.settings = replace(one.settings, max_steps=round(left.pop(0) / per_person))
+            whole = [*curve, *map(line, one.train())]
+            yield ended(one, whole, time.perf_counter() - start - elsewhere)
+            elsewhere += time.perf_counter() - begun
+    yield ended(learner, curve, time.perf_counter() - start - elsewhere)
 
 
 def learned_by(state: State) -> Learned:

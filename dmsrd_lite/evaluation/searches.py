@@ -43,9 +43,9 @@ def compare(
     """A row for each newcomer, search and budget: ``known`` policies explain mixtures of ``people``.
 
     budget: so many of a search's candidates; the best of them by the search's own numbers is measured on
-    fresh rollouts. steps: environment steps until then; above_floor: its KL above the newcomer's floor
-    (nats); error: largest difference to a true weight; deviation: largest Cramer-Rao bound of a weight among
-    the parents (``weight_deviations``). One more row for the likeliest weights, which take no step.
+    fresh rollouts. steps: environment steps of these candidates; above_floor: its KL above the newcomer's
+    floor (nats); error: largest difference to a true weight; deviation: largest Cramer-Rao bound of a weight
+    among the parents (``weight_deviations``). One more row for the likeliest weights, which take no step.
     """
     shown, weights, floor = newcomers(people, n, seed)
     for i in range(n):
@@ -56,7 +56,7 @@ def compare(
             fit = find(known, one, extend(seed, 3, i))
             for budget in budgets:
                 best = fit.candidates[fit.divergences[:budget].argmin()]
-                spent = fit.steps * min(budget, len(fit.candidates)) / len(fit.candidates)
+                spent = fit.searched * min(budget, len(fit.candidates)) / len(fit.candidates)
                 rows.append((name, budget, spent, best))
         rows.append(("likeliest actions", 0, 0.0, likeliest_weights(known, one)))
         candidates = np.array([best for *_, best in rows])

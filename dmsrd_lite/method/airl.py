@@ -216,7 +216,10 @@ class AIRL:
         self.reward_optimizer = torch.optim.Adam(learned, lr=settings.discriminator_rate, fused=True)
 
     def networks(self) -> dict[str, torch.Tensor]:
-        """Copies of all that a later learner needs, by name; the leading axis is the strategy's."""
+        """Copies of all that a later learner needs, by name; the leading axis is the strategy's.
+
+        The entropy weights c are not kept: tuned from the settings' anew, rounds came out nearer.
+        """
         modules = {**self.modules, "policies": self.learned_policies}.items()
         found = {f"{name}.{k}": v.clone() for name, module in modules for k, v in module.state_dict().items()}
         for name, samples in (("coverage", self.coverage), ("anchors", self.anchors or self._anchors())):

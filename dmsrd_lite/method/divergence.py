@@ -109,6 +109,16 @@ def divergence_floor(
     return np.array([demonstration_divergence(domain, one, again) for one, again in pairs])
 
 
+def rollouts_measured(demonstrations: DemonstrationSet, n_rollouts: int) -> int:
+    """How many rollouts of a policy ``policy_divergences`` makes when it is asked for ``n_rollouts``: with
+    ``matched_starts`` the same number from each of the k starts, ``n_rollouts / k`` (rounded, at least one).
+    """
+    if not demonstrations.domain.comparison.matched_starts:
+        return n_rollouts
+    k = demonstrations.observations.shape[1]
+    return max(1, round(n_rollouts / k)) * k
+
+
 def policy_divergences(
     actor: Policies,
     demonstrations: DemonstrationSet,
@@ -122,20 +132,18 @@ def policy_divergences(
 
     ``common`` as in ``rollout``; ``measure``: another divergence, "other divergences fit too" (the paper).
 
-    In a domain with ``matched_starts`` the rollouts start as the demonstration did, ``n_rollouts / k`` times
-    (rounded, at least once) from each of its k starts; where the demonstrations hold no reset seeds, from as
-    many random starts.
+    In a domain with ``matched_starts`` the rollouts start as the demonstration did (``rollouts_measured``);
+    where the demonstrations hold no reset seeds, from as many random starts.
     """
     domain, shown, starts = demonstrations.domain, demonstrations.observations, None
+    n_rollouts = rollouts_measured(demonstrations, n_rollouts)
     if domain.comparison.matched_starts:
-        repeats = max(1, round(n_rollouts / shown.shape[1]))
-        n_rollouts = repeats * shown.shape[1]
         if demonstrations.reset_seeds is None:
             text = f"{domain.name}: the demonstrations hold no reset_seeds; rollouts start elsewhere"
             warnings.warn(text, stacklevel=2)
         else:
             known = np.broadcast_to(demonstrations.reset_seeds, (actor.n_strategies, shown.shape[1]))
-            starts = np.tile(known, repeats)
+            starts = np.tile(known, n_rollouts // shown.shape[1])
     data = rollout(
         domain, actor, n_rollouts, seed, reset_seeds=starts, horizon=demonstrations.horizon, common=common
     )

@@ -11,7 +11,12 @@ from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.domains.domain import Seed, extend
 from dmsrd_lite.learning.networks import Actor, Policies, one_thread
-from dmsrd_lite.method.divergence import Measure, demonstration_divergence, policy_divergences
+from dmsrd_lite.method.divergence import (
+    Measure,
+    demonstration_divergence,
+    policy_divergences,
+    rollouts_measured,
+)
 
 
 def check_weights(weights: ArrayLike, n_strategies: int) -> np.ndarray:
@@ -71,7 +76,8 @@ class MixtureFit:
     divergence: float
     candidates: np.ndarray  # (n, M)
     divergences: np.ndarray  # (n,), of the few rollouts of the search
-    steps: int  # environment steps spent
+    steps: int  # environment steps spent ...
+    searched: int = 0  # ... and those before the finalists were measured again
 
 
 def inside_bounds(actor: Actor, demonstration: DemonstrationSet) -> tuple[np.ndarray, ...]:
@@ -153,7 +159,8 @@ class Search:
 
     def measure(self, weights: np.ndarray, part: int, n_rollouts: int) -> np.ndarray:
         """Divergences (K,) of mixtures (K, M) by so many rollouts; ``part`` of the seed."""
-        self.steps += len(weights) * n_rollouts * self.demonstration.horizon
+        n_flown = rollouts_measured(self.demonstration, n_rollouts)
+        self.steps += len(weights) * n_flown * self.demonstration.horizon
         return policy_divergences(
             Mixtures(self.actor, weights),
             self.demonstration,
@@ -168,11 +175,11 @@ class Search:
     ) -> MixtureFit:
         """The finalists measured by the protocol of every KL here, and the winner once more on rollouts of
         its own, because the least of several noisy numbers is too low."""
-        s = self.settings
+        s, searched = self.settings, self.steps
         finalists = np.union1d(np.argsort(divergences, kind="stable")[: s.n_finalists], always).astype(int)
         chosen = candidates[finalists[self.measure(candidates[finalists], 3, s.final_rollouts).argmin()]]
         divergence = float(self.measure(chosen[None], 4, s.final_rollouts)[0])
-        return MixtureFit(chosen, divergence, candidates, divergences, self.steps)
+        return MixtureFit(chosen, divergence, candidates, divergences, self.steps, searched)
 
 
 def search_mixture(

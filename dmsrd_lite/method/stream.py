@@ -92,7 +92,10 @@ def learn_stream(
         n, bare = len(after.records), replace(after, demonstrations=None, records=())
         with journal.open("a") as file:
             file.write(json.dumps([digests[n - 1], after.records[-1]]) + "\n")
-        for name in (f"checkpoint_{n % 2}", *([f"kept_{n:06}"] if n in kept else ())):
+        for name in (
+            *([f"kept_{n:06}"] if n in kept else ()),
+            f"checkpoint_{n % 2}",
+        ):  # a resume is from n on
             save_state(folder / f"{name}.safetensors", bare)
         yield after
 

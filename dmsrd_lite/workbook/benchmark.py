@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from dmsrd_lite.domains import Domain, InputError
+from dmsrd_lite.evaluation.comparison import METHODS
 from dmsrd_lite.evaluation.statistics import Ranks, compare_correlations, mean_interval, rank_methods
 from dmsrd_lite.evaluation.worth import able
 from dmsrd_lite.method.dmsrd import BETTER_MIXTURE, MIXTURE
@@ -30,22 +32,30 @@ SHARED = ("AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD as printed", "DMSRD"
 OURS, RIVALS = ("DMSRD as printed", "DMSRD"), ("AIRL Single", "MSRD")
 TRIALS = (0, 1, 2)
 
-# The paper's Table 1: environment return, log-likelihood, KL (as its authors scored them), and its Friedman
-# tests of these three.
+# The paper's Table 1: environment return, log-likelihood, KL (as its authors scored them).
 PAPER = {
     "inverted_pendulum": {
         "AIRL Single": (-172.7, -11546.0, 4.08),
         "MSRD": (-166.4, -40870.5, 7.67),
         "DMSRD as printed": (-38.5, -6525.0, 4.01),
-        "Friedman's Q(2)": (29.4, 16.8, 22.2),
     },
     "lunar_lander": {
         "AIRL Single": (-11546.0, -15137.8, 71.4),
         "MSRD": (-9895.3, -11124.2, 70.9),
         "DMSRD as printed": (-2405.5, -6723.7, 79.9),
-        "Friedman's Q(2)": (7.8, 22.2, 2.4),
     },
 }
+# Its tests of these three: Friedman's Q(2) and p, then Nemenyi's p of DMSRD against AIRL Single and MSRD.
+PAPER_TESTS = {
+    "inverted_pendulum": [
+        (29.4, "< .01", "< .01", "< .01"), (16.8, "< .01", "no", "< .01"), (22.2, "< .01", "no", "< .01"),
+    ],
+    "lunar_lander": [
+        (7.8, "< .05", "< .05", "no"), (22.2, "< .01", "< .01", "< .01"), (2.4, ".30", "", ""),
+    ],
+}  # fmt: skip
+PAPER_PEARSON = {"inverted_pendulum": 0.953, "lunar_lander": 0.614}  # of its DMSRD
+PAPER_KNOWN = {"inverted_pendulum": (0.57, 1.0), "lunar_lander": (0.83, 1.0)}  # recognised: MSRD, DMSRD
 
 
 def record_name(domain: str, part: str, trial: int) -> str:
@@ -79,10 +89,14 @@ class Benchmark:
         """One number for each demonstration of each trial: (trials * n,)."""
         return np.concatenate([row[metric] for row in self.per_trial(method, start, budget)]).astype(float)
 
+    @property
+    def people(self) -> list[int]:
+        """Who each of ``values`` is of."""
+        return [person for trial in sorted(self.known) for person in self.known[trial]["arrival"]]
+
     def difference(self, one: Entry, other: Entry, metric: str) -> tuple[float, float, float]:
         """Mean of one method's minus another's and its 95 % interval (``over_people``)."""
-        people = [person for trial in sorted(self.known) for person in self.known[trial]["arrival"]]
-        return over_people(self.values(*one, metric) - self.values(*other, metric), people)
+        return over_people(self.values(*one, metric) - self.values(*other, metric), self.people)
 
     def over_trials(self, entry: Entry, value: Callable[[dict[str, Any]], float]) -> list[float]:
         """A number for each trial."""
@@ -96,11 +110,11 @@ def over_people(values: ArrayLike, people: Sequence[int]) -> tuple[float, float,
     return float(each.mean()), *mean_interval(each)
 
 
-def in_words(values: np.ndarray) -> str:
-    """Mean and 95 % bootstrap interval."""
-    low, high = mean_interval(values)
-    digits = 1 if abs(values.mean()) >= 10 else 2
-    return f"{values.mean():.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+def in_words(values: np.ndarray, people: Sequence[int]) -> str:
+    """Mean and 95 % bootstrap interval (``over_people``)."""
+    mean, low, high = over_people(values, people)
+    digits = 1 if abs(mean) >= 10 else 2
+    return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def collect(domain: Domain, trials: Iterator[tuple[int, dict[str, Any]]]) -> Benchmark:
@@ -132,9 +146,22 @@ def load(domain: Domain, settings: BenchmarkLesson, folder: Path = RECORDS) -> B
                 if record["settings"] != settings_of(settings):
                     text = f"record {name} was made with other settings than this lesson's"
                     raise InputError(f"{text}; expected records of one plan: run it again")
+                for label, rows in record["results"]["scores"].items():
+                    method, start = label.split(", ")
+                    row = rows.get(str(settings.main), {})
+                    if method in SHARED and start == "nothing" and "worth" not in row:
+                        text = f"record {name} does not say what the task reward of {label} teaches"
+                        raise InputError(f"{text}; expected records of one plan: run it again")
                 yield trial, record["results"]
 
     return collect(domain, results())
+
+
+def entries(found: Benchmark, settings: BenchmarkLesson) -> list[Entry]:
+    """Who is compared in the tables: every method from each start, at the main budget of that start."""
+    main = {"clone": settings.from_clone, "nothing": settings.main}
+    pairs = [(method, start, budget) for start, budget in main.items() for method in METHODS]
+    return [(m, s, budget) for m, s, budget in pairs if budget in found.budgets(m, s)]
 
 
 def verdict(difference: tuple[float, float, float], larger_is_better: bool) -> str:
@@ -162,7 +189,8 @@ def summary(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     table = {}
     for method, start, budget in entries:
         rows = found.per_trial(method, start, budget)
-        line = {title: in_words(found.values(method, start, budget, m)) for m, (title, _) in METRICS.items()}
+        each = {title: found.values(method, start, budget, m) for m, (title, _) in METRICS.items()}
+        line = {title: in_words(values, found.people) for title, values in each.items()}
         line["do the task"] = f"{np.mean([able(found.domain, row).mean() for row in rows]):.0%}"
         line["million steps each"] = f"{np.mean([row['spent'] for row in rows]) / 1e6:.2f}"
         n = len(rows[0]["divergence"])
@@ -170,18 +198,21 @@ def summary(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
         table[f"{method}, {start}"] = line
     own = {"return": "own_return", "log-likelihood": "own_log_likelihood", "KL": "floor"}
     joined = {k: np.concatenate([one[name] for one in found.known.values()]) for k, name in own.items()}
-    table["the demonstrators"] = {k: in_words(values) for k, values in joined.items()}
+    table["the demonstrators"] = {k: in_words(values, found.people) for k, values in joined.items()}
     return pd.DataFrame(table).T.fillna("")
 
 
 def as_published(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
-    """The same by the authors' scoring, beside the paper's numbers."""
+    """The same by the authors' scoring, beside the paper's numbers, and which of them ours beat."""
     table: dict[str, dict[str, Any]] = {}
     for method, start, budget in entries:
         line = {t: found.values(method, start, budget, m).mean().round(1) for m, t in PUBLISHED.items()}
-        paper = PAPER[found.domain.name].get(method, ("", "", ""))
-        theirs = {f"paper: {t}": value for t, value in zip(PUBLISHED.values(), paper, strict=True)}
-        table[f"{method}, {start}"] = line | theirs
+        cells = PAPER[found.domain.name].get("DMSRD as printed" if method == "DMSRD" else method)
+        if cells:
+            theirs = dict(zip(PUBLISHED.values(), cells, strict=True))
+            better = [t for t in theirs if (line[t] < theirs[t] if t == "KL" else line[t] > theirs[t])]
+            line |= {f"paper: {t}": x for t, x in theirs.items()} | {"better": ", ".join(better) or "none"}
+        table[f"{method}, {start}"] = line
     own = {t: "floor" if t == "KL" else m for m, t in PUBLISHED.items()}
     joined = {k: np.concatenate([one[name] for one in found.known.values()]) for k, name in own.items()}
     table["the demonstrators"] = {k: values.mean().round(1) for k, values in joined.items()}
@@ -219,24 +250,23 @@ def ranks(found: Benchmark, entries: Sequence[Entry], metric: str) -> Ranks:
 
 
 def friedman(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
-    """The paper's tests: AIRL Single, MSRD and DMSRD as printed, for each start and score."""
+    """The paper's tests of AIRL Single, MSRD and DMSRD as printed, for each start and score, with its own."""
     lines = {}
     for start in dict.fromkeys(start for _, start, _ in entries):
         three = [e for e in entries if e[1] == start and e[0] in (*RIVALS, OURS[0])]
         if len(three) < 3:
             continue
-        for k, (metric, (title, _)) in enumerate(METRICS.items()):
+        at = {e[0]: i for i, e in enumerate(three)}
+        tests = PAPER_TESTS[found.domain.name]
+        for (metric, (title, _)), (q, p, *pairs) in zip(METRICS.items(), tests, strict=True):
             result = ranks(found, three, metric)
-            at = {e[0]: i for i, e in enumerate(three)}
-            p = {f"p: {m}, {OURS[0]}": result.pairwise_p[at[m], at[OURS[0]]] for m in RIVALS}
-            told = {
-                "Q(2)": result.q,
-                "paper's Q": PAPER[found.domain.name]["Friedman's Q(2)"][k],
-                "p": result.p,
-            }
-            mean_ranks = {f"rank of {m}": result.mean_ranks[k] for m, k in at.items()}
-            lines[f"{title}, {start}"] = told | p | mean_ranks
-    return pd.DataFrame(lines).T.round(3)
+            told = {"Q(2)": round(result.q, 1), "paper's Q": q, "p": round(result.p, 3), "paper's p": p}
+            for rival, theirs in zip(RIVALS, pairs, strict=True):
+                told[f"p against {rival}"] = round(result.pairwise_p[at[rival], at[OURS[0]]], 3)
+                told[f"paper's against {rival}"] = theirs
+            mean_ranks = {f"rank of {m}": round(result.mean_ranks[k], 2) for m, k in at.items()}
+            lines[f"{title}, {start}"] = told | mean_ranks
+    return pd.DataFrame(lines).T
 
 
 def correlations(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
@@ -316,32 +346,34 @@ def cost(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
 def newcomers(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     """What a person costs at arrival: explained by a mixture, or AIRL trained; and who does the task in the
     end."""
+    header = ["run", "explained", "search", "AIRL", "round", "seconds", "pure", "does the task"]
     lines = []
     for method, start, budget in entries:
         for row in found.per_trial(method, start, budget):
             can = able(found.domain, row)
             for i, r in enumerate(row["decisions"]):
-                how = "AIRL trained" if r["steps"]["airl"] else "a mixture"
-                spent = r["steps"]["search"] / 1e3, r["steps"]["airl"] / 1e3
-                lines.append([f"{method}, {start}", how, *spent, float(i in row["pure"]), can[i]])
-    header = ["run", "explained", "thousand search steps", "thousand AIRL steps", "pure", "does the task"]
-    table = pd.DataFrame(lines, columns=header)
-    people = table.groupby(["run", "explained"]).size().rename("people")
-    return pd.concat([people, table.groupby(["run", "explained"]).mean(numeric_only=True)], axis=1).round(2)
+                how, k = "AIRL trained" if r["steps"]["airl"] else "a mixture", r["steps"]
+                spent = (x / 1e3 for x in (k["search"], k["airl"], k["msrd"] + k["between_class"]))
+                who = f"{method}, {start}", how
+                lines.append([*who, *spent, r["seconds"], float(i in row["pure"]), can[i]])
+    if not lines:
+        return pd.DataFrame(columns=header[2:])
+    groups = pd.DataFrame(lines, columns=header).groupby(["run", "explained"])
+    return pd.concat([groups.size().rename("people"), groups.mean(numeric_only=True)], axis=1).round(2)
 
 
 def _of_newcomers(
     found: Benchmark, entry: Entry, alone: Entry
 ) -> Iterator[tuple[str, str, tuple[float, float, float], bool]]:
     """Claims 6 and 8, person by person against AIRL Single: number, claim, difference, and is more better;
-    steps are those of the decision, search and AIRL, in millions."""
+    steps are all those at the arrival (search, AIRL and the round that follows), in millions."""
     does, mixed, everybody, n_able = [], [], [], 0
     for trial, row, other in zip(
         sorted(found.known), found.per_trial(*entry), found.per_trial(*alone), strict=True
     ):
         can, others = (able(found.domain, one).astype(float) for one in (row, other))
         for i, (who, r) in enumerate(zip(found.known[trial]["arrival"], row["decisions"], strict=True)):
-            steps = (r["steps"]["search"] + r["steps"]["airl"] - other["spent"]) / 1e6
+            steps = (sum(r["steps"].values()) - other["spent"]) / 1e6
             everybody.append((steps, who))
             if i not in row["pure"]:
                 does.append((can[i] - others[i], who))
@@ -392,18 +424,28 @@ def _of_scores(found: Benchmark, entry: Entry, there: dict[str, Entry]) -> Itera
             yield "-", f"better {title}", "cloning", _with_interval(gap), verdict(gap, larger), ""
 
 
+def _over_trials(
+    found: Benchmark, one: Entry, other: Entry, value: Callable[[dict[str, Any]], float]
+) -> list[float]:
+    """Differences of a number, trial by trial."""
+    pairs = zip(*(found.over_trials(e, value) for e in (one, other)), strict=True)
+    return [a - b for a, b in pairs]
+
+
+def _recognized(most: int, row: dict[str, Any]) -> float:
+    """Share of the strategy rewards that know their person on ``most`` fresh takes."""
+    return row["recognized_fresh"][str(most)] / len(row["pure"])
+
+
 def _of_rewards(
     found: Benchmark, entry: Entry, there: dict[str, Entry], most: int
 ) -> Iterator[tuple[str, ...]]:
     """Claims 3, 4 and 5, trial by trial; what BCD does only of ours, which has a twin without it."""
-
-    def known(row: dict[str, Any]) -> float:
-        return row["recognized_fresh"][str(most)] / len(row["pure"])
-
-    correlation, twin = itemgetter("pearson"), "DMSRD without BCD"
+    correlation, known, twin = itemgetter("pearson"), partial(_recognized, most), "DMSRD without BCD"
     claims: list[tuple[str, str, str, Callable]] = [
         ("3", "stronger correlation", "AIRL Batch", correlation),
         ("3", "stronger correlation", "MSRD", correlation),
+        ("4", "more strategies recognised", "AIRL Single", known),
         ("4", "more strategies recognised", "MSRD", known),
     ]
     if entry[0] == "DMSRD":
@@ -411,10 +453,29 @@ def _of_rewards(
         claims.append(("5", "BCD: stronger correlation", twin, correlation))
     for number, says, rival, value in claims:
         if rival in there:
-            pairs = zip(*(found.over_trials(e, value) for e in (entry, there[rival])), strict=True)
-            gaps = [a - b for a, b in pairs]
+            gaps = _over_trials(found, entry, there[rival], value)
             numbers = ", ".join(f"{gap:+.3f}" for gap in gaps)
             yield number, says, rival, numbers, verdict((0.0, min(gaps), max(gaps)), True), ""
+
+
+def standing(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:
+    """Is DMSRD better, tied or worse, score by score, against each rival from the same start? By the interval
+    over people, of rewards by all trials."""
+    table: dict[str, dict[str, str]] = {}
+    words = {"holds": "better", "does not hold": "worse", "a tie": "a tie"}
+    of_rewards: dict[str, Callable] = {
+        "Pearson of R_Task": itemgetter("pearson"),
+        "recognised": partial(_recognized, most),
+    }
+    for entry in (e for e in entries if e[0] in OURS):
+        for rival in (e for e in entries if e[1] == entry[1] and e[0] in (*RIVALS, "AIRL Batch")):
+            told = {t: verdict(found.difference(entry, rival, m), up) for m, (t, up) in METRICS.items()}
+            for title, value in of_rewards.items():
+                if title != "recognised" or rival[0] != "AIRL Batch":  # which has no strategy rewards
+                    gaps = _over_trials(found, entry, rival, value)
+                    told[title] = verdict((0.0, min(gaps), max(gaps)), True)
+            table[f"{entry[0]} against {rival[0]}, {entry[1]}"] = {k: words[v] for k, v in told.items()}
+    return pd.DataFrame(table).T.fillna("")
 
 
 def verdicts(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:

@@ -400,6 +400,9 @@ class LifelongLesson:  # 08
         """Ours, with one deviation from the paper taken back at a time."""
         loop = self.ours
         found = {"as it is": loop, **taken_back(loop), "all are remembered": replace(loop, remembered=0)}
+        absolute = replace(loop.msrd, between_class_relative=False)
+        found["Equation 4 as printed"] = replace(loop, msrd=absolute)
+        found["longer rounds"] = replace(loop, msrd=replace(loop.msrd, n_iterations=5))
         return found | {"policies learn after mixtures": replace(loop, policies_after_mixture=True)}
 
 

@@ -1,4 +1,4 @@
-"""Records of long runs, with what decides their numbers: settings, versions, a hash of the source."""
+"""Records of long runs, with what made them: settings and versions; for plans a hash of the source."""
 
 import ast
 import dataclasses
@@ -77,12 +77,16 @@ def settings_of(settings: Any) -> Any:
     return plain(dataclasses.asdict(settings))
 
 
-def recorded(name: str) -> dict:
-    """The results of a record; nothing, and one line that says so, where it is not there yet."""
+def recorded(name: str, settings: Any = None) -> dict:
+    """The results of a record; nothing, and one line that says so, where it is not there yet. A line, too,
+    where it was made with other ``settings``."""
     if not (RECORDS / f"{name}.json").exists():
         print(f"no record {name} yet; a run with preset=full, record=True writes it")
         return {}
-    return load_record(name)[0]["results"]
+    record, _ = load_record(name)
+    if settings is not None and record["settings"] != settings_of(settings):
+        print(f"record {name} was made with other settings than this lesson's: a run now may differ")
+    return record["results"]
 
 
 def save_record(

@@ -8,9 +8,11 @@ import numpy as np
 import pandas as pd
 
 from dmsrd_lite.demonstrations import write_atomically
-from dmsrd_lite.domains import DOMAINS, Domain
+from dmsrd_lite.domains import DOMAINS, Domain, InputError
 from dmsrd_lite.evaluation.worth import able
+from dmsrd_lite.workbook import benchmark
 from dmsrd_lite.workbook.lessons import lessons
+from dmsrd_lite.workbook.presets import choose
 from dmsrd_lite.workbook.records import RECORDS, ROOT, load_record
 
 README = ROOT / "papermill_runs" / "README.md"
@@ -173,16 +175,41 @@ def page(table: pd.DataFrame) -> str:
     for (lesson, domain), found in table.groupby(["lesson", "domain"], sort=False):
         rows = found.pivot_table("value", "method", "metric", sort=False)
         shown = [name for name in SHOWN if name in rows]
-        seeds = found["seed"].nunique()
-        parts.append(f"### {lesson}, {DOMAINS[domain].title} ({seeds} seed{'s' * (seeds > 1)})\n")
-        parts.append(f"| method | {' | '.join(SHOWN[name] for name in shown)} |")
-        parts.append("|---" * (len(shown) + 1) + "|")
+        seeds = found.groupby("method")["seed"].nunique()
+        parts.append(f"### {lesson}, {DOMAINS[domain].title}\n")
+        parts.append(f"| method | seeds | {' | '.join(SHOWN[name] for name in shown)} |")
+        parts.append("|---" * (len(shown) + 2) + "|")
         for method, row in rows[rows[shown].notna().any(axis=1)].iterrows():
             cells = ["-" if np.isnan(row[name]) else f"{row[name]:.3g}" for name in shown]
-            parts.append(f"| {str(method).replace('|', chr(92) + '|')} | {' | '.join(cells)} |")
+            line = [str(method).replace("|", chr(92) + "|"), str(seeds[method]), *cells]
+            parts.append(f"| {' | '.join(line)} |")
         parts.append("")
+        if lesson == "07_benchmark":
+            parts += [*_benchmark(DOMAINS[domain])]
     text = "\n".join(parts).strip() or "*No record yet.*"
     return Path(__file__).with_suffix(".md").read_text("utf-8").replace("{records}", text)
+
+
+def _benchmark(domain: Domain) -> Iterator[str]:
+    """The tables of lesson 07, by its own functions, when all its trials are there."""
+    settings = choose("07_benchmark", domain.name, "full")
+    try:
+        found = benchmark.load(domain, settings)
+    except InputError as error:
+        yield f"No table with intervals and no verdict yet: {error}.\n"
+        return
+    entries, most = benchmark.entries(found, settings), settings.n_fresh[-1]
+    for title, table in (
+        ("Means over people and trials with 95 % bootstrap intervals", benchmark.summary(found, entries)),
+        ("DMSRD against each rival", benchmark.standing(found, entries, most)),
+        ("The paper's claims", benchmark.verdicts(found, entries, most).reset_index()),
+    ):
+        yield f"*{title}.*\n"
+        rows = table.reset_index(names="") if title[0] != "T" else table
+        yield f"| {' | '.join(map(str, rows))} |"
+        yield "|---" * rows.shape[1] + "|"
+        yield from (f"| {' | '.join(map(str, row))} |" for row in rows.to_numpy())
+        yield ""
 
 
 def parameters() -> str:

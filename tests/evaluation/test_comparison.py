@@ -67,14 +67,24 @@ def test_from_nothing_the_mean_of_functions_is_learned_and_stored(method, small_
     assert len(rewards) == learned.policies.n_strategies
 
 
-def test_what_is_known_on_the_way_is_what_a_shorter_training_knows(small_set):
-    on_the_way = list(comparison.train_to("MSRD", small_set, FROM_NOTHING, 0, budgets=(20, 50, 10_000)))
-    assert [spent for spent, _ in on_the_way] == [50, 100]
-    short = replace(FROM_NOTHING, msrd=replace(FROM_NOTHING.msrd, n_iterations=1))
-    alone = train_method("MSRD", small_set, short, 0)
-    for name, kept in on_the_way[0][1].policies.state_dict().items():
-        assert torch.equal(kept, alone.policies.state_dict()[name]), name
-    assert len(on_the_way[0][1].curve) == 1
+@pytest.mark.parametrize("method", ["AIRL Single", "AIRL Batch", "MSRD"])
+@pytest.mark.parametrize("last_rate", [1.0, 0.1])
+def test_what_is_known_at_a_budget_is_what_a_training_for_it_knows(method, last_rate, small_set):
+    def settings(steps):
+        longer = {"n_iterations": 100, "max_steps": steps, "last_rate": last_rate, "policy_average": 0.5}
+        alone, shared = (replace(one, **longer) for one in (_ALONE, _SHARED))
+        return MethodSettings(alone, shared, _LOOP, replace(alone, max_steps=2 * steps))
+
+    looks = list(comparison.train_to(method, small_set, settings(400), 0, budgets=(100, 200, 400)))
+    assert [spent for spent, _ in looks] == [100, 200, 400]
+    for spent, found in looks:
+        alone = train_method(method, small_set, settings(spent), 0)
+        assert found.steps == alone.steps
+        assert found.curve == alone.curve
+        for name, kept in found.tensors().items():
+            assert np.array_equal(kept, alone.tensors()[name]), name
+    policies = [found.policies.state_dict()["log_sigma"] for _, found in looks]
+    assert not torch.equal(policies[0], policies[1])
 
 
 def test_a_method_spends_what_its_settings_and_records_say(small_set):

@@ -113,3 +113,5 @@ def test_lander_rollouts_start_as_the_demonstration_did(lander_set, monkeypatch)
     with pytest.warns(UserWarning, match="hold no reset_seeds"):
         divergence.policy_divergences(actor, replace(given, reset_seeds=None), 0)
     assert seen[2].rewards.shape[1] == 10
+    for n, data in zip((3, 1, 10), seen, strict=True):
+        assert divergence.rollouts_measured(given, n) == data.rewards.shape[1]

@@ -46,7 +46,8 @@ def test_the_first_demonstration_makes_the_first_strategy(three, monkeypatch):
     (record,) = state.records
     assert [record[k] for k in ("branch", "kl_mix", "weights", "recognized")] == [
         "new strategy", None, [1.0], [True]]  # fmt: skip
-    assert record["steps"] == {"search": 0, "airl": 50 + 3 * 50, "msrd": 0, "between_class": 0}
+    kl_new = 10 * 50
+    assert record["steps"] == {"search": kl_new, "airl": 50 + 3 * 50, "msrd": 0, "between_class": 0}
     assert (state.weights.tolist(), state.pure, state.n_strategies) == ([[1.0]], (0,), 1)
     assert same(state.networks, made[0]["learner"].networks())
     assert not state.rewards().evaluate(three.observations, "task").any()
@@ -71,7 +72,10 @@ def test_decisions_by_hand(kl_mix, kl_new, branch, three, states, monkeypatch):
     assert record["n_strategies"] == len(state.rewards().evaluate(np.zeros(4))) == 1 + created
     assert state.pure == ((0, 1) if created else (0,))
     assert state.weights.tolist() == ([[1, 0], [0, 1]] if created else [[1], [1]])
-    assert record["steps"]["search"] == 50 * (1 + 2 + 2)
+    decided = (
+        0 if kl_new is None else 10 + 2 * ROUGH.measured_rollouts * created
+    )  # KL_new, KL after the round
+    assert record["steps"]["search"] == 50 * (1 + 2 + 2 + decided)
     assert [record["steps"][k] > 0 for k in ("airl", "msrd")] == [kl_new is not None, created]
     assert same(state.networks, states[1].networks) != created, "one strategy alone has no round"
 
@@ -120,27 +124,26 @@ def test_records_say_everything_in_json(states):
         assert record["seconds"] > 0
 
 
-def test_steps_are_those_of_the_simulator(three, states, monkeypatch):
-    """Of the learners and the searches; the rollouts that only measure a KL are not counted."""
-    simulated, searched, rollout, search = Counter(), [], airl.rollout, dmsrd.search_mixture
+@pytest.mark.parametrize("form", [ROUGH, replace(ROUGH, search_again=False)])
+def test_steps_are_those_of_the_simulator(form, three, states, monkeypatch):
+    """Of the learners and of every KL that decides something; a KL for the record alone is not counted."""
+    simulated, rollout = Counter(), airl.rollout
 
     def counting(module, *arguments, **keywords):
         data = rollout(*arguments, **keywords)
         simulated[module] += data.n_steps
         return data
 
-    def searching(*arguments, **keywords):
-        before, fit = simulated[divergence], search(*arguments, **keywords)
-        searched.append(simulated[divergence] - before)
-        return fit
-
     for module in (airl, divergence):
         monkeypatch.setattr(module, "rollout", partial(counting, module))
-    for module in (dmsrd, rounds):
-        monkeypatch.setattr(module, "search_mixture", searching)
-    steps = after(states[2], three.select([2]), ROUGH).records[2]["steps"]
+    known = replace(states[2], form=form.form)
+    record = after(known, three.select([2]), form).records[2]
+    steps, told = record["steps"], form.measured_rollouts * three.horizon
+    for_the_record = told * len(record["kl_before_round"])
+    for_the_record += 0 if form.search_again else told * len(record["kl_after_round"])
+    assert for_the_record > 0
     assert steps["airl"] + steps["msrd"] == simulated[airl] > steps["airl"] > 0
-    assert 0 < steps["search"] == sum(searched) < simulated[divergence]
+    assert 0 < steps["search"] == simulated[divergence] - for_the_record
 
 
 def test_the_threshold_is_calibrated_by_the_demonstration_itself(three, domain):

@@ -82,6 +82,7 @@ def test_candidates_are_the_pure_ones_the_incumbent_and_others_on_the_simplex():
     assert np.allclose(check_weights(fit.candidates, 3), fit.candidates)
     finalists = 4 + (fit.divergences[3] > np.sort(fit.divergences)[3])  # and the incumbent, where it is none
     assert fit.steps == 60 * (28 * 2 + finalists * 4 + 4)
+    assert fit.searched == 60 * 28 * 2
 
 
 def test_the_search_is_deterministic_for_any_number_of_threads(domain):

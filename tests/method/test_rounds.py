@@ -33,7 +33,8 @@ def test_a_round_has_all_demonstrations_and_the_decided_weights(three, mixed, mo
     assert same(one["networks"], mixed.networks)
     assert same(one["learner"].networks(), state.networks)
     assert one["learner"].n_averaged == 2 + 2, "the average of the rewards goes on over the rounds"
-    assert steps == {"search": 0, "msrd": 2 * 50, "between_class": 0}
+    kl_after = 3 * TINY.measured_rollouts * three.horizon
+    assert steps == {"search": kl_after, "msrd": 2 * 50, "between_class": 0}
     assert record["recognized"].tolist() == state.recognized([0, 1, 2]).tolist()
     for name, then in (("before", mixed), ("after", state)):
         assert np.array_equal(record[f"kl_{name}_round"], then.divergences(range(3), [0, 3], 2))
@@ -76,7 +77,7 @@ def test_an_older_mixture_is_searched_again_where_its_kl_has_risen(
     monkeypatch.setattr(State, "divergences", lambda *_: np.array(kls.pop(0)))
     state, record, steps = rounds.play_round(known, False, 1e-3, TINY, [0])
     assert len(searches) == again, "neither those of the strategies nor the newest is searched again"
-    assert steps["search"] == 11 * again
+    assert steps["search"] == 11 * again + 4 * TINY.measured_rollouts * three.horizon
     assert record["searched_again"] == ({2: [after_round, found]} if again else {})
     weights = [0.6, 0.4] if replaced else [0.25, 0.75]
     assert state.weights.tolist() == [[1, 0], [0, 1], weights, [0.5, 0.5]]

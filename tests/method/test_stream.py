@@ -192,3 +192,20 @@ def test_a_folder_of_another_stream_is_refused(other, three, states, tmp_path):
 def test_a_state_of_other_demonstrations_cannot_go_on(three, states, tmp_path):
     with pytest.raises(InputError, match=r"^a state that knows other demonstrations; expected [^\n]*$"):
         next(learn_stream(states[1], three.select([1, 0]), TINY, tmp_path))
+
+
+def test_killed_between_two_files_a_kept_state_is_there_in_the_end(three, states, tmp_path, monkeypatch):
+    save = stream.save_state
+
+    def killed(path, state):
+        if path.name.startswith("checkpoint_") and len(state.weights) == 2:
+            raise KeyboardInterrupt
+        return save(path, state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stream, "save_state", killed)
+        with pytest.raises(KeyboardInterrupt):
+            list(learn_stream(State(PENDULUM, 0), three, TINY, tmp_path, kept=(2,)))
+    list(learn_stream(State(PENDULUM, 0), three, TINY, tmp_path, kept=(2,)))
+    (kept,) = kept_states(tmp_path, three)
+    assert_same(kept, states[2])

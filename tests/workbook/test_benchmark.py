@@ -18,7 +18,8 @@ def row(returns, **others):
     """Scores of two demonstrations."""
     scores = {
         "environment_return": returns, "failure_share": [0, 0], "divergence": [1.5, 2.5], "spent": 500_000,
-        "log_likelihood_per_step": [0.0, 0.1], "search_steps": 0,
+        "log_likelihood_per_step": [0.0, 0.1], "search_steps": 0, "pearson": 0.9, "pure": [0, 1],
+        "recognized_fresh": {"30": 1}, "decisions": (),
     }  # fmt: skip
     return {**scores, **others}
 
@@ -94,6 +95,12 @@ def test_records_are_read_whole_or_not_at_all(tmp_path):
         InputError, match=r"clone_seed0 was made with other settings than this lesson's; expec"
     ):
         benchmark.load(INVERTED_PENDULUM, other, tmp_path)
+    name = benchmark.record_name("inverted_pendulum", "rivals", 0)
+    scores = {"known": trial((0, 0))["known"], "scores": {"MSRD, nothing": {"500000": row([0.0, 0.0])}}}
+    save_record(name, {}, LESSON, scores, {}, tmp_path)
+    with pytest.raises(InputError, match=r"rivals_seed0 does not say what the task reward of MSRD, nothing"):
+        benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
+    save(tmp_path, "rivals", 0)
     assert json.loads(files[-1].read_text())["parameters"]["seed"] == 2
     files[-1].unlink()
     with pytest.raises(
@@ -118,12 +125,14 @@ def test_a_verdict_asks_for_the_whole_interval(difference, larger, expected):
 
 def test_what_newcomers_cost_and_whether_their_mixtures_do_the_task():
     """Of two trials with two people each, three are mixtures; one of them does a task that AIRL does not."""
-    steps = [{"search": 100_000, "airl": a} for a in (400_000, 0, 0, 500_000)]
+    others = {"search": 100_000, "msrd": 30_000, "between_class": 20_000}
+    steps = [{**others, "airl": a} for a in (400_000, 0, 0, 500_000)]
     trials = []
     for k in (0, 1):
         one = trial((-9.0, -9.0), arrival=(2 * k, 2 * k + 1))
-        decided = {"decisions": [{"steps": x, "branch": ""} for x in steps[2 * k : 2 * k + 2]]}
-        one["scores"]["DMSRD, nothing"]["500000"] |= {"pure": [0] if k == 0 else [], **decided}
+        decided = [{"steps": x, "branch": "", "seconds": 2.0} for x in steps[2 * k : 2 * k + 2]]
+        pure = [0] if k == 0 else [9]
+        one["scores"]["DMSRD, nothing"]["500000"] |= {"pure": pure, "decisions": decided}
         returns = (-9.0, -9.0 if k else -1e6)
         one["scores"]["AIRL Single, nothing"] = {"500000": row(list(returns))}
         trials.append((k, one))
@@ -132,13 +141,49 @@ def test_what_newcomers_cost_and_whether_their_mixtures_do_the_task():
     told = {claim: (number, gaps) for number, claim, gaps, _ in benchmark._of_newcomers(found, *pair)}
     assert told["mixtures do the task (3 of 3)"] == ("6", (pytest.approx(1 / 3), 0, 1))
     number, (mean, low, high) = told["a new user costs fewer million steps"]
-    assert (number, mean) == ("8", pytest.approx(np.mean([0, -0.4, -0.4, 0.1])))
+    assert (number, mean) == ("8", pytest.approx(np.mean([0.05, -0.35, -0.35, 0.15])))
     assert low < mean < high
     assert len(told) == 2  # two people needed no AIRL: too few for a line
+    cost = benchmark.newcomers(found, pair).loc["DMSRD, nothing"]
+    assert cost.loc["a mixture", ["people", "search", "AIRL", "round", "seconds"]].tolist() == [
+        2,
+        100,
+        0,
+        50,
+        2,
+    ]
+    assert benchmark.newcomers(found, pair[1:]).empty
     table = benchmark.verdicts(found, pair, 30)
     assert table.loc["8", "verdict"] == "a tie"
     assert table.loc["6", "difference"].startswith("+0.33 [+0.00, ")
     assert "    a tie (2): mixtures do the task (3 of 3) (AIRL Single); a new" in benchmark.in_short(table)
+
+
+def test_standing_says_who_is_better_score_by_score():
+    """DMSRD returns more by as much for everybody, and knows one more person in each trial."""
+    trials = [(k, trial((-3.0, -2.0))) for k in (0, 1)]
+    for _, one in trials:
+        one["scores"]["DMSRD, nothing"]["500000"] |= {"recognized_fresh": {"30": 2}}
+        one["scores"]["MSRD, nothing"] = {"500000": row([-4.0, -3.0], log_likelihood_per_step=[0.1, 0.2])}
+        one["scores"]["AIRL Batch, nothing"] = {"500000": row([-3.0, -1.0], pure=[])}
+    found = benchmark.collect(INVERTED_PENDULUM, iter(trials))
+    table = benchmark.standing(found, [(m, "nothing", 500_000) for m in ("AIRL Batch", "MSRD", "DMSRD")], 30)
+    told = {"return": "better", "log-likelihood": "worse", "KL": "a tie", "Pearson of R_Task": "a tie"}
+    assert table.loc["DMSRD against MSRD, nothing"].to_dict() == told | {"recognised": "better"}
+    batch = table.loc["DMSRD against AIRL Batch, nothing"]
+    assert (batch["return"], batch["recognised"]) == ("a tie", "")
+
+
+def test_the_papers_cells_stand_beside_those_of_the_same_method():
+    trials = [(k, trial((-3.0, -2.0))) for k in (0, 1)]
+    known = {"published_return": [-10.0], "published_log_likelihood": [-9000.0]}
+    for _, one in trials:
+        one["known"] |= known
+        one["scores"]["DMSRD, nothing"]["500000"] |= known
+    found = benchmark.collect(INVERTED_PENDULUM, iter(trials))
+    line = benchmark.as_published(found, [("DMSRD", "nothing", 500_000)]).loc["DMSRD, nothing"]
+    assert (line["return"], line["paper: return"]) == (-10.0, -38.5)
+    assert line["better"] == "return, KL"
 
 
 def test_an_interval_is_over_people():

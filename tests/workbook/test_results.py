@@ -48,8 +48,8 @@ def test_the_page_shows_a_row_for_each_method_and_means_over_seeds():
         for seed, value in ((0, -3.0), (1, -4.0))
     ]
     page = results.page(pd.DataFrame(rows, columns=results.COLUMNS))
-    assert "### 02_airl, Inverted Pendulum (2 seeds)" in page
-    assert "\n| AIRL | -3.5 |" in page
+    assert "### 02_airl, Inverted Pendulum\n" in page
+    assert "\n| AIRL | 2 | -3.5 |" in page
     assert "No record yet" not in page
     assert "No record yet" in results.page(pd.DataFrame([], columns=results.COLUMNS))
 
