@@ -103,10 +103,14 @@ class Benchmark:
         return [float(value(row)) for row in self.per_trial(*entry)]
 
 
+def by_person(values: ArrayLike, people: Sequence[int]) -> np.ndarray:
+    """Means over what one person has in several trials, which is not independent: (people,)."""
+    return pd.Series(values, dtype=float).groupby(list(people)).mean().to_numpy()
+
+
 def over_people(values: ArrayLike, people: Sequence[int]) -> tuple[float, float, float]:
-    """Mean and 95 % bootstrap interval over people; what one person has in several trials is averaged first:
-    it is not independent."""
-    each = pd.Series(values, dtype=float).groupby(list(people)).mean().to_numpy()
+    """Mean and 95 % bootstrap interval over people (``by_person``)."""
+    each = by_person(values, people)
     return float(each.mean()), *mean_interval(each)
 
 
@@ -323,8 +327,9 @@ def recognition(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
 
 
 def cost(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
-    """What was created, which branches were taken, and what it took; one number for each trial, or means."""
-    table = {}
+    """What was created, which branches were taken, what it took (a number for each trial, or means), and the
+    part of the plan that holds it."""
+    table, part_of = {}, {(m, start): part for part, pairs in BENCHMARK.items() for m, start in pairs}
     for entry in entries:
         rows = found.per_trial(*entry)
         counts = {
@@ -339,7 +344,7 @@ def cost(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
             ("minutes", "seconds", 60),
         ):
             line[title] = f"{np.mean([row[key] for row in rows]) / unit:.2f}"
-        table[f"{entry[0]}, {entry[1]}"] = line
+        table[f"{entry[0]}, {entry[1]}"] = line | {"record": part_of[entry[:2]]}
     return pd.DataFrame(table).T
 
 
