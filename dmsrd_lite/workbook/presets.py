@@ -321,7 +321,7 @@ BENCHMARK = {  # what each part trains: method, start
 class BenchmarkLesson:  # 07
     domain: str
     users: tuple[int, ...]
-    budgets: tuple[int, ...]  # environment steps per demonstration; rivals are looked at on the way
+    budgets: tuple[int, ...]  # steps per demonstration; one training serves a rival at all (``train_to``)
     printed: tuple[int, ...]  # DMSRD as printed is trained for each of these
     main: int  # of which the tables are made
     from_clone: int  # the budget of everybody who starts from a clone
