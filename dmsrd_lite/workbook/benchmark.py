@@ -31,6 +31,7 @@ CORRELATIONS = {"pearson": "Pearson", "spearman": "Spearman", "spearman_of_good"
 SHARED = ("AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD as printed", "DMSRD")  # one reward for all
 OURS, RIVALS = ("DMSRD as printed", "DMSRD"), ("AIRL Single", "MSRD")
 TRIALS = (0, 1, 2)
+VERDICTS = ("holds", "a tie", "does not hold")
 
 # The paper's Table 1: environment return, log-likelihood, KL (as its authors scored them).
 PAPER = {
@@ -177,14 +178,10 @@ def verdict(difference: tuple[float, float, float], larger_is_better: bool) -> s
 def first_budget(holds: Callable[[int], str], budgets: Sequence[int]) -> str:
     """A claim over the budget, in words: at which of them it holds."""
     found = {budget: holds(budget) for budget in budgets}
-    where = [f"{budget / 1e6:g} M" for budget, text in found.items() if text == "holds"]
-    if len(where) == len(found):
-        return "holds"
-    ties = [f"{budget / 1e6:g} M" for budget, text in found.items() if text == "a tie"]
-    parts = [f"holds at {', '.join(where)} steps"] * bool(where) + [f"a tie at {', '.join(ties)}"] * bool(
-        ties
-    )
-    return "; ".join(parts) or "does not hold"
+    if len(set(found.values())) == 1:
+        return found[budgets[0]]
+    where = {text: [f"{b / 1e6:g} M" for b in found if found[b] == text] for text in VERDICTS}
+    return "; ".join(f"{text} at {', '.join(at)}" for text, at in where.items() if at)
 
 
 def summary(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
@@ -239,12 +236,12 @@ def rescued(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
         for trial, row in zip(sorted(found.known), found.per_trial(method, start, budget), strict=True):
             for i, r in enumerate(row["decisions"]):
                 if r["branch"] == BETTER_MIXTURE:
-                    who = (f"{method}, {start}", trial, found.known[trial]["arrival"][i])
+                    who = (f"{method}, {start}", budget / 1e6, trial, found.known[trial]["arrival"][i])
                     alone = found.rows[trial, "AIRL Single", start, budget] if single else None
                     other = alone["divergence"][i] if alone else np.nan
                     lines.append([*who, r["kl_mix"], r["kl_new"], row["divergence"][i], other])
-    header = ["run", "trial", "person", "mixture", "dropped AIRL", "in the end", "AIRL Single"]
-    return pd.DataFrame(lines, columns=header).round(1)
+    header = ["run", "M steps", "trial", "person", "mixture", "dropped AIRL", "in the end", "AIRL Single"]
+    return pd.DataFrame(lines, columns=header).round({name: 1 for name in header[4:]})
 
 
 def ranks(found: Benchmark, entries: Sequence[Entry], metric: str) -> Ranks:

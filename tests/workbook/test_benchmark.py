@@ -195,7 +195,9 @@ def test_an_interval_is_over_people():
 
 def test_a_verdict_over_the_budget():
     told = {100_000: "holds", 250_000: "a tie", 1_000_000: "does not hold"}
-    assert benchmark.first_budget(told.get, list(told)) == "holds at 0.1 M steps; a tie at 0.25 M"
+    assert benchmark.first_budget(told.get, list(told)) == (
+        "holds at 0.1 M; a tie at 0.25 M; does not hold at 1 M"
+    )
     assert benchmark.first_budget(told.get, [1_000_000]) == "does not hold"
     assert benchmark.first_budget(told.get, [100_000]) == "holds"
 
