@@ -19,6 +19,7 @@ from dmsrd_lite.method.between_class_discrimination import recognized
 from dmsrd_lite.method.policy_mixture import Mixtures
 from dmsrd_lite.method.rewards import Rewards
 from dmsrd_lite.workbook import benchmark, presets
+from dmsrd_lite.workbook.lessons import lessons
 from dmsrd_lite.workbook.records import RECORDS, settings_of
 
 
@@ -70,6 +71,14 @@ def assert_policies_score(actor, shown, seed, known, label, flown_again=False):
     assert close[spared].sum() >= 0.9 * spared.sum(), f"{label}: of those that never fail"
     n_able, n_known = (able(shown.domain, row).sum() for row in (scores, known))
     assert abs(n_able - n_known) <= 1, f"{label}: one may fall here and not there"
+
+
+def test_lessons_07_and_08_draw_records_of_todays_settings():
+    for name in (*of("07"), *of("08")):
+        record, _ = stored.record_of(name)
+        domain, lesson = record["parameters"]["domain"], "_".join(name.split("_")[:2])
+        lesson = next(path.stem for path in lessons() if path.stem.startswith(lesson))
+        assert record["settings"] == settings_of(presets.choose(lesson, domain, "full")), name
 
 
 @pytest.mark.verify
