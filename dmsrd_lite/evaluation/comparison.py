@@ -117,15 +117,23 @@ def train_to(
         clone = AIRL(shown, only_clone, seed).policies
         yield 0, Learned(clone, weights, seconds=time.perf_counter() - start)
         return
+    seconds = time.perf_counter() - start  # of the start
+    for one, curve, own_seconds in _trainings(learner, n, budgets, progress):
+        spent, models = one.steps * len(one.x), (one.learned_policies, one.learned_rewards)
+        known = models[0], weights, models[1], part, pure, spent, 0, seconds + own_seconds, curve
+        yield spent // n, Learned(*known)
+
+
+def _trainings(
+    learner: AIRL, n: int, budgets: Sequence[int], progress: Callable
+) -> Iterator[tuple[AIRL, list[list[float]], float]]:
+    """``learner`` trained for each of ``budgets`` (``train_to``; ``n`` demonstrations) and to its end, with
+    its curve and seconds: a training, and copies of it from where a budget's rate begins to fall."""
     per_person = len(learner.x) / n  # steps for each demonstration in one of a strategy's
     limit, alike = learner.settings.max_steps, 0.5 if learner.settings.last_rate < 1 else 1.0
     left = [b for b in budgets if not limit or b < limit * per_person]
+    start, elsewhere = time.perf_counter(), 0.0  # seconds: of copies, and of whoever looks at them
     curve: list[list[float]] = []
-    elsewhere = 0.0  # seconds: of copies, and of whoever looks at them
-
-    def ended(one: AIRL, curve: list[list[float]], seconds: float) -> tuple[int, Learned]:
-        spent, models = one.steps * len(one.x), (one.learned_policies, one.learned_rewards)
-        return spent // n, Learned(models[0], weights, models[1], part, pure, spent, 0, seconds, curve)
 
     def line(record: dict) -> list[float]:
         return [record["steps"], *(record["environment_return"] / record["horizon"]).round(4)]
@@ -136,9 +144,9 @@ def train_to(
             begun, one = time.perf_counter(), copy.deepcopy(learner)
             one.settings = replace(one.settings, max_steps=round(left.pop(0) / per_person))
             whole = [*curve, *map(line, one.train())]
-            yield ended(one, whole, time.perf_counter() - start - elsewhere)
+            yield one, whole, time.perf_counter() - start - elsewhere
             elsewhere += time.perf_counter() - begun
-    yield ended(learner, curve, time.perf_counter() - start - elsewhere)
+    yield learner, curve, time.perf_counter() - start - elsewhere
 
 
 def learned_by(state: State) -> Learned:

@@ -218,7 +218,7 @@ class AIRL:
     def networks(self) -> dict[str, torch.Tensor]:
         """Copies of all that a later learner needs, by name; the leading axis is the strategy's.
 
-        The entropy weights c are not kept: rounds that went on with them came out no nearer.
+        The entropy weights c are not kept: whoever goes on tunes them from the settings' anew.
         """
         modules = {**self.modules, "policies": self.learned_policies}.items()
         found = {f"{name}.{k}": v.clone() for name, module in modules for k, v in module.state_dict().items()}

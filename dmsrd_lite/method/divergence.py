@@ -17,6 +17,7 @@ from dmsrd_lite.learning.networks import Policies
 from dmsrd_lite.learning.rollouts import rollout
 
 K_NEIGHBORS = 3
+N_ROLLOUTS = 10  # of a policy, for one KL
 Measure = Callable[[Domain, np.ndarray, np.ndarray], float]  # of (a, T, obs_dim) shown and (b, T, obs_dim)
 
 
@@ -119,12 +120,17 @@ def rollouts_measured(demonstrations: DemonstrationSet, n_rollouts: int) -> int:
     return max(1, round(n_rollouts / k)) * k
 
 
+def steps_measured(demonstrations: DemonstrationSet, n_rollouts: int = N_ROLLOUTS) -> int:
+    """The environment steps of one of ``policy_divergences``' KL."""
+    return demonstrations.horizon * rollouts_measured(demonstrations, n_rollouts)
+
+
 def policy_divergences(
     actor: Policies,
     demonstrations: DemonstrationSet,
     seed: Seed,
     *,
-    n_rollouts: int = 10,
+    n_rollouts: int = N_ROLLOUTS,
     common: bool = False,
     measure: Measure = demonstration_divergence,
 ) -> np.ndarray:

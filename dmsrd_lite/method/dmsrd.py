@@ -11,7 +11,7 @@ import numpy as np
 from dmsrd_lite.demonstrations import DemonstrationSet, plain
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.method.airl import AIRL, AIRLSettings
-from dmsrd_lite.method.divergence import policy_divergences, rollouts_measured
+from dmsrd_lite.method.divergence import policy_divergences, steps_measured
 from dmsrd_lite.method.kl_threshold import calibrate_threshold
 from dmsrd_lite.method.msrd import MSRDSettings
 from dmsrd_lite.method.policy_mixture import MixtureSettings, search_mixture
@@ -105,7 +105,7 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
     )  # AIRL on tau_i, made when it is asked for
     eps, reference = calibrate_threshold(new, candidate, s, [*seed, 7])
     if new.domain.comparison.matched_starts and not s.kl_threshold:  # the reference was flown
-        steps["search"] += new.horizon * rollouts_measured(new, s.mixture.final_rollouts)
+        steps["search"] += steps_measured(new, s.mixture.final_rollouts)
     kl_mix = kl_new = float("inf")
     if state.n_strategies:
         policies = state.policies().actor()
@@ -118,7 +118,7 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
             pass
         learned, steps["airl"] = candidate().learned_policies.actor(), candidate().steps
         kl_new = float(policy_divergences(learned, new, [*seed, 2, 9])[0])  # 10: KL_new
-        steps["search"] += new.horizon * rollouts_measured(new, 10)
+        steps["search"] += steps_measured(new)
         if kl_mix < kl_new:  # 11: then AIRL leaves no trace
             branch, known = BETTER_MIXTURE, state.explained(new, fit.weights)  # 12: keep w, no new strategy
         else:  # 14

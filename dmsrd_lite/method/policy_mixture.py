@@ -11,12 +11,7 @@ from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.domains.domain import Seed, extend
 from dmsrd_lite.learning.networks import Actor, Policies, one_thread
-from dmsrd_lite.method.divergence import (
-    Measure,
-    demonstration_divergence,
-    policy_divergences,
-    rollouts_measured,
-)
+from dmsrd_lite.method.divergence import Measure, demonstration_divergence, policy_divergences, steps_measured
 
 
 def check_weights(weights: ArrayLike, n_strategies: int) -> np.ndarray:
@@ -159,8 +154,7 @@ class Search:
 
     def measure(self, weights: np.ndarray, part: int, n_rollouts: int) -> np.ndarray:
         """Divergences (K,) of mixtures (K, M) by so many rollouts; ``part`` of the seed."""
-        n_flown = rollouts_measured(self.demonstration, n_rollouts)
-        self.steps += len(weights) * n_flown * self.demonstration.horizon
+        self.steps += len(weights) * steps_measured(self.demonstration, n_rollouts)
         return policy_divergences(
             Mixtures(self.actor, weights),
             self.demonstration,

@@ -9,7 +9,7 @@ from dmsrd_lite.learning.networks import Policies
 from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method.airl import clone_demonstrations
 from dmsrd_lite.method.between_class_discrimination import states_of
-from dmsrd_lite.method.divergence import rollouts_measured
+from dmsrd_lite.method.divergence import steps_measured
 from dmsrd_lite.method.msrd import MSRD
 from dmsrd_lite.method.policy_mixture import search_mixture
 from dmsrd_lite.method.state import State
@@ -55,8 +55,7 @@ def play_round(
         state, steps["msrd"] = replace(state, networks=learner.networks()), learner.steps * len(pure)
         after, weights, policies = measure(), state.weights.copy(), state.policies().actor()
         if s.search_again:  # else nothing is decided by it
-            flown = rollouts_measured(state.shown, s.measured_rollouts) * state.shown.horizon
-            steps["search"] += len(after) * flown
+            steps["search"] += len(after) * steps_measured(state.shown, s.measured_rollouts)
         risen = np.flatnonzero(after > thresholds[: len(after)])  # its own strategies have moved away
         for k in risen if s.search_again else ():
             if (i := int(some[k])) not in {*pure, newest}:

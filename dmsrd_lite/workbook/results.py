@@ -202,10 +202,10 @@ def _benchmark(domain: Domain) -> Iterator[str]:
     for title, table in (
         ("Means over people and trials with 95 % bootstrap intervals", benchmark.summary(found, entries)),
         ("DMSRD against each rival", benchmark.standing(found, entries, most)),
-        ("The paper's claims", benchmark.verdicts(found, entries, most).reset_index()),
+        ("The paper's claims", benchmark.verdicts(found, entries, most)),
     ):
         yield f"*{title}.*\n"
-        rows = table.reset_index(names="") if title[0] != "T" else table
+        rows = table.reset_index().rename(columns={"index": ""})
         yield f"| {' | '.join(map(str, rows))} |"
         yield "|---" * rows.shape[1] + "|"
         yield from (f"| {' | '.join(map(str, row))} |" for row in rows.to_numpy())

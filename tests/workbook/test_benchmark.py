@@ -145,13 +145,8 @@ def test_what_newcomers_cost_and_whether_their_mixtures_do_the_task():
     assert low < mean < high
     assert len(told) == 2  # two people needed no AIRL: too few for a line
     cost = benchmark.newcomers(found, pair).loc["DMSRD, nothing"]
-    assert cost.loc["a mixture", ["people", "search", "AIRL", "round", "seconds"]].tolist() == [
-        2,
-        100,
-        0,
-        50,
-        2,
-    ]
+    spent = cost.loc["a mixture", ["people", "search", "AIRL", "round", "seconds"]]
+    assert spent.tolist() == [2, 100, 0, 50, 2]
     assert benchmark.newcomers(found, pair[1:]).empty
     table = benchmark.verdicts(found, pair, 30)
     assert table.loc["8", "verdict"] == "a tie"
