@@ -122,6 +122,7 @@ def test_student_copies_are_up_to_date_and_hold_no_solution(tmp_path):
         (None, 1.0, "is a return missing"),
         ([1.0, 2.0], [1.0, 2.0, 3.0], r"shape \(2,\); expected an array of shape \(3,\)"),
         ([1.0, 2.5], [1.0, 2.0], "expected"),
+        ([1.0, 1 / 3], [1.0, 0.3333], "0.33333333333"),
         ([2.0, 1.0], [1.0, 2.0], "swapped"),
         ("mixture", "new strategy", "mixture"),
         (True, 1.0, None),

@@ -21,7 +21,11 @@ def check(found: Any, right: Any, hints: Mapping[str, Any] | None = None, tolera
     shapes = _shape(found), _shape(right)
     if shapes[0] != shapes[1]:
         raise AssertionError(f"The answer is {shapes[0]}; expected {shapes[1]}.")
-    raise AssertionError(f"The answer is\n{_shown(found)}\nexpected\n{_shown(right)}")
+    for digits in (4, 16):  # numbers that differ must look different
+        texts = _shown(found, digits), _shown(right, digits)
+        if texts[0] != texts[1]:
+            break
+    raise AssertionError("The answer is\n{}\nexpected\n{}".format(*texts))
 
 
 def same(one: Any, other: Any, tolerance: float = 1e-6) -> bool:
@@ -54,5 +58,7 @@ def _shape(x: Any) -> str:
     return f"an array of shape {shape}" if shape else "a number"
 
 
-def _shown(x: Any) -> str:
-    return str(x if isinstance(x, (str, tuple)) or x is None else np.round(np.asarray(_plain(x)), 4))
+def _shown(x: Any, digits: int) -> str:
+    if isinstance(x, (str, tuple)) or x is None:
+        return str(x)
+    return np.array2string(np.round(np.asarray(_plain(x)), digits), precision=digits)
