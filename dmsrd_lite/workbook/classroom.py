@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 import tempfile
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,18 +23,7 @@ from dmsrd_lite.workbook.lessons import NOTEBOOKS
 from dmsrd_lite.workbook.records import ROOT
 
 SOLUTIONS = NOTEBOOKS / "exercises" / "solutions"
-SETTINGS = '''"""nbgrader's settings of a course with the exercises of dmsrd_lite."""
-
-from nbconvert.preprocessors import CSSHTMLHeaderPreprocessor
-from nbgrader.preprocessors import ClearHiddenTests, GetGrades
-
-c = get_config()
-c.GenerateFeedback.preprocessors = [GetGrades, ClearHiddenTests, CSSHTMLHeaderPreprocessor]
-c.CourseDirectory.course_id = "dmsrd_lite"
-c.ClearSolutions.code_stub = {"python": 'raise NotImplementedError("not yet")'}
-c.ClearSolutions.text_stub = "*Your answer.*"
-c.Execute.timeout = 10  # seconds of a cell: an endless loop costs its own task only
-'''
+SETTINGS = SOLUTIONS.parent / "nbgrader_config.py"
 
 
 class Submission(NamedTuple):
@@ -54,17 +44,20 @@ def release(course: str | Path, lessons: Sequence[str] = ()) -> list[Path]:
             raise InputError(f"{lesson} has no exercise; expected one of {', '.join(known)}")
     if course.is_relative_to(ROOT):
         raise InputError(f"{course} is inside of this repository; expected a folder outside")
-    settings = course / "nbgrader_config.py"
+    if course.exists() and not course.is_dir():
+        raise InputError(f"{course} is a file; expected a new folder, or one made by release")
+    settings = course / SETTINGS.name
     if course.is_dir() and any(course.iterdir()) and not settings.exists():
         raise InputError(
             f"{course} is not empty and not a course; expected a new folder, or one made by release"
         )
     course.mkdir(parents=True, exist_ok=True)
     if not settings.exists():
-        settings.write_text(SETTINGS)
+        shutil.copyfile(SETTINGS, settings)
     written = []
     for lesson in lessons or known:
-        shutil.copytree(SOLUTIONS / lesson, course / "source" / lesson, dirs_exist_ok=True)
+        if not (course / "source" / lesson).exists():  # a teacher may have changed theirs
+            shutil.copytree(SOLUTIONS / lesson, course / "source" / lesson)
         _expect(_nbgrader(course).generate_assignment(lesson), f"{lesson} could not be released")
         written.append(course / "release" / lesson / f"{lesson}.ipynb")
     return written
@@ -88,7 +81,14 @@ def find_submissions(folder: str | Path) -> tuple[list[Submission], list[dict[st
     name, as nbgrader lays them).
     """
     folder = Path(folder).resolve()
-    paths = [p for p in sorted(folder.rglob("*.ipynb")) if ".ipynb_checkpoints" not in p.parts]
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder; expected one with STUDENT/LESSON.ipynb for each student")
+    hidden = (".", "__MACOSX")  # checkpoints, and what archives of other systems hold
+    paths = [
+        path
+        for path in sorted(folder.rglob("*.ipynb"))
+        if not any(part.startswith(hidden) for part in path.relative_to(folder).parts)
+    ]
     if not paths:
         raise InputError(f"{folder}: no notebook in it; expected STUDENT/LESSON.ipynb for each student")
     known, taken, notes = lessons_with_exercise(), defaultdict(list), []
@@ -97,7 +97,7 @@ def find_submissions(folder: str | Path) -> tuple[list[Submission], list[dict[st
         home = home.parent if home.name in known and home != folder else home
         student = home.name if home != folder else "?"
         if lesson not in known:
-            text = f"{path.name} is no exercise; expected the name of one, as {known[0]}.ipynb"
+            text = f"{path.name} is no exercise; expected the name of the copy that was handed out"
             notes.append({"student": student, "lesson": "", "note": text})
         elif student == "?":
             text = f"{path.name} lies beside the students' folders; expected it in one of them"
@@ -115,18 +115,19 @@ def find_submissions(folder: str | Path) -> tuple[list[Submission], list[dict[st
     return found, notes
 
 
-def inspect(path: Path) -> tuple[str, bool]:
+def inspect(path: Path, handed_out: Path) -> tuple[str, bool]:
     """What is unusual about a submitted notebook, in words ("" for nothing), and whether it can be graded."""
     try:
         notebook = nbformat.read(path, 4)
     except Exception as error:
         return f"does not open as a notebook ({type(error).__name__})", False
     cells = [name for name in map(task_of, notebook.cells) if name]
-    if not cells:
+    tasks = {task_of(cell) for cell in nbformat.read(handed_out, 4).cells} - {"setup", "open"}
+    if not tasks & set(cells):
         return "holds no task of the exercise; expected the copy that was handed out", False
     notes = []
     if doubles := sorted({name for name in cells if cells.count(name) > 1}):
-        notes.append(f"the cell {', '.join(doubles)} is there more than once; the first one is graded")
+        notes.append(f"the cell {', '.join(doubles)} is there more than once; all ran, the last one counts")
     kernel = notebook.metadata.get("kernelspec", {}).get("name", "none")
     if kernel != "python3":
         notes.append(f"asks for the kernel {kernel}; graded with python3")
@@ -140,8 +141,9 @@ def task_of(cell: nbformat.NotebookNode) -> str | None:
 def mended(path: Path, handed_out: Path) -> tuple[nbformat.NotebookNode, list[str]]:
     """A submission as it can be graded, and the names of the cells that were missing.
 
-    Each task's cell is the first of its name; what is there again is plain code. A check that is missing is
-    put back before the next task. An answer is not: a stub might hide what stands in another cell.
+    Each task's cell is the first of its name; what is there again is plain code. A check that is missing, or
+    the first cell's imports, is put back before the next task. An answer is not: a stub might hide what
+    stands in another cell.
     """
     notebook, seen, gone = nbformat.read(path, 4), set(), []
     for cell in notebook.cells:
@@ -156,6 +158,7 @@ def mended(path: Path, handed_out: Path) -> tuple[nbformat.NotebookNode, list[st
         elif name:
             gone.append(name)
             if not cell.metadata["nbgrader"]["solution"]:
+                gone[-1] += " (put back)"
                 notebook.cells.insert(place, cell)
     return notebook, gone[::-1]
 
@@ -163,28 +166,37 @@ def mended(path: Path, handed_out: Path) -> tuple[nbformat.NotebookNode, list[st
 def grade(course: str | Path, submissions: str | Path, progress: Callable = iter) -> Path:
     """Grade every notebook under ``submissions``; the table of ``report``."""
     course = _course(course)
-    found, notes = find_submissions(submissions)
-    here = {one.student for one in found} | {note["student"] for note in notes}
-    notes += [note for note in _notes(course) if note["student"] not in here]
-    os.environ["PYTHONWARNINGS"] = "ignore"  # nbgrader takes a warning for a wrong answer
+    if (folder := Path(submissions).resolve()).is_relative_to(course):
+        raise InputError(
+            f"{folder} is inside of the course; expected a folder outside, nothing there is kept"
+        )
+    found, notes = find_submissions(folder)
+    here = {(one.student, one.lesson) for one in found} | {(n["student"], n["lesson"]) for n in notes}
+    here |= {(student, "") for student, _ in here}  # what was said of a name that is no exercise's
+    notes += [note for note in _notes(course) if (note["student"], note["lesson"]) not in here]
     api = _nbgrader(course)
     for student, lesson, path in progress(found):
-        text, gradable = inspect(path)
-        if gradable and not (course / "release" / lesson).is_dir():
-            text, gradable = "was not released in this course", False
+        handed_out = course / "release" / lesson / f"{lesson}.ipynb"
+        text, gradable = "was not released in this course", False
+        if handed_out.exists():
+            text, gradable = inspect(path, handed_out)
         if gradable:
             place = course / "submitted" / student / lesson
+            notebook, gone = mended(path, handed_out)
+            if gone:
+                text = f"{text}; " * bool(text) + f"missing: {', '.join(gone)}"
             shutil.rmtree(place, ignore_errors=True)
             place.mkdir(parents=True)
-            notebook, gone = mended(path, course / "release" / lesson / f"{lesson}.ipynb")
-            if gone:
-                text = f"{text}; " * bool(text) + f"missing: {', '.join(gone)}; checks were put back"
             nbformat.write(notebook, place / f"{lesson}.ipynb")
             answer = api.autograde(lesson, student)
             if answer["success"]:
                 api.generate_feedback(lesson, student)
             else:
-                text, gradable = _last_line(answer), False
+                text, gradable = _why(answer), False
+                with api.gradebook as book:  # no points rather than none
+                    book.remove_submission(lesson, student)
+        elif _has(api, lesson, student):
+            text += "; the points are of an earlier hand-in"
         if text or not gradable:
             what = text if gradable else f"not graded: {text}"
             notes.append({"student": student, "lesson": lesson, "note": what})
@@ -259,7 +271,20 @@ def _nbgrader(course: Path) -> Any:
     config.CourseDirectory.root = str(course)
     config.NbGraderAPI.log_level = logging.ERROR
     logging.getLogger("traitlets").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module="nbgrader")  # of its database
     return NbGraderAPI(config=config)
+
+
+def _has(api: Any, lesson: str, student: str) -> bool:
+    """Does the gradebook hold points of an earlier submission?"""
+    with api.gradebook as book:
+        return any((a.name, one.student.id) == (lesson, student) for a, one, _ in _graded(book))
+
+
+def _why(answer: dict[str, Any]) -> str:
+    """Why a notebook could not be graded, in words where they are known."""
+    dead = "DeadKernelError" in f"{answer.get('log')} {answer.get('error')}"
+    return "its code ended Python (exit, or out of memory)" if dead else _last_line(answer)
 
 
 def _expect(answer: dict[str, Any], text: str) -> None:

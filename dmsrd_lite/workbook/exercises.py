@@ -7,6 +7,13 @@ import numpy as np
 import torch
 
 
+class Wrong(AssertionError):
+    """A wrong answer; in a notebook its sentence alone is shown."""
+
+    def _render_traceback_(self) -> list[str]:
+        return [f"AssertionError: {self}"]
+
+
 def check(found: Any, right: Any, hints: Mapping[str, Any] | None = None, tolerance: float = 1e-6) -> None:
     """Nothing where ``found`` is right; else ``AssertionError``, with the hint whose wrong answer it is.
 
@@ -17,15 +24,15 @@ def check(found: Any, right: Any, hints: Mapping[str, Any] | None = None, tolera
         return
     for hint, wrong in (hints or {}).items():
         if same(found, wrong, tolerance):
-            raise AssertionError(hint)
+            raise Wrong(hint)
     shapes = _shape(found), _shape(right)
     if shapes[0] != shapes[1]:
-        raise AssertionError(f"The answer is {shapes[0]}; expected {shapes[1]}.")
+        raise Wrong(f"The answer is {shapes[0]}; expected {shapes[1]}.")
     for digits in (4, 16):  # numbers that differ must look different
         texts = _shown(found, digits), _shown(right, digits)
         if texts[0] != texts[1]:
             break
-    raise AssertionError("The answer is\n{}\nexpected\n{}".format(*texts))
+    raise Wrong("The answer is\n{}\nexpected\n{}".format(*texts))
 
 
 def same(one: Any, other: Any, tolerance: float = 1e-6) -> bool:

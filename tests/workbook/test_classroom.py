@@ -62,6 +62,7 @@ def test_release_makes_a_course_that_nbgrader_knows(course):
             {"ada": "handed in 2 times, in ada and late/ada; expected once"},
         ),
         ({"ada/00_start_here.ipynb": ""}, {"ada": "is no exercise"}),
+        ({"ada/04_policy_mixture.ipynb": "", "__MACOSX/ada/._04_policy_mixture.ipynb": ""}, {}),
     ],
 )
 def test_who_handed_in_what(files, notes, tmp_path):
@@ -86,7 +87,10 @@ def test_bad_input_is_one_sentence(course, tmp_path, capsys):
         ): "00_start_here has no exercise; expected one of 01",
         ("release", tmp_path / "full"): "not empty and not a course",
         ("release", ROOT / "class"): "inside of this repository; expected a folder outside",
-        ("grade", course, tmp_path / "nobody"): "no notebook in it; expected STUDENT/LESSON.ipynb",
+        ("release", tmp_path / "full" / "thesis.txt"): "is a file; expected a new folder",
+        ("grade", course, tmp_path / "full"): "no notebook in it; expected STUDENT/LESSON.ipynb",
+        ("grade", course, tmp_path / "nobody"): "nobody is no folder; expected one with STUDENT/LESSON.ipynb",
+        ("grade", course, course / "submitted"): "inside of the course; expected a folder outside",
         ("report", tmp_path / "nowhere"): "no course; expected a folder made by",
         ("report", course): "nothing was graded yet; expected `classroom grade` first",
     }.items():
@@ -107,6 +111,7 @@ def test_bad_input_is_one_sentence(course, tmp_path, capsys):
             True,
         ),
         (lambda notebook: notebook.cells.clear(), "no task of the exercise", False),
+        (lambda notebook: notebook.update(exercises.student_copy("02_airl")), "no task of the exercise", False),
         (lambda notebook: None, "", True),
     ],
 )
@@ -114,7 +119,8 @@ def test_what_is_unusual_is_noticed(change, words, gradable, tmp_path):
     copy = exercises.student_copy(LESSON)
     change(copy)
     hand_in(tmp_path, "ada", copy)
-    said, can = classroom.inspect(tmp_path / "ada" / f"{LESSON}.ipynb")
+    hand_in(tmp_path, "out", exercises.student_copy(LESSON))
+    said, can = classroom.inspect(*(tmp_path / who / f"{LESSON}.ipynb" for who in ("ada", "out")))
     assert words in said
     assert bool(said) == bool(words)
     assert can == gradable
@@ -124,15 +130,27 @@ def test_a_check_that_was_deleted_is_put_back_in_its_place(tmp_path):
     whole = exercises.student_copy(LESSON)
     hand_in(tmp_path, "out", whole)
     names = [classroom.task_of(cell) for cell in whole.cells]
-    for missing in ("mix-check", "explain-check", "explain"):
+    for missing in ("setup", "mix-check", "explain-check", "explain"):
         copy = exercises.student_copy(LESSON)
         copy.cells = [cell for cell in copy.cells if classroom.task_of(cell) != missing]
         hand_in(tmp_path, "ada", copy)
         places = (tmp_path / who / f"{LESSON}.ipynb" for who in ("ada", "out"))
         notebook, gone = classroom.mended(*places)
-        assert gone == [missing]
+        put_back = missing != "explain"
+        assert gone == [f"{missing} (put back)" if put_back else missing]
         found = [classroom.task_of(cell) for cell in notebook.cells if classroom.task_of(cell)]
-        assert found == [name for name in names if name and (name != missing or "check" in name)]
+        assert found == [name for name in names if name and (name != missing or put_back)]
+
+
+def test_notes_of_another_lesson_stay(course, tmp_path):
+    own = shutil.copytree(course, tmp_path / "own")
+    hand_in(tmp_path / "first", "ada", "no notebook", "07_benchmark.ipynb")
+    hand_in(tmp_path / "first", "ada", "no notebook", "homework.ipynb")
+    classroom.grade(own, tmp_path / "first")
+    hand_in(tmp_path / "second", "ada", "no notebook", f"{LESSON}.ipynb")
+    table = pd.read_csv(classroom.grade(own, tmp_path / "second"), keep_default_na=False)
+    assert list(table.lesson) == [LESSON, "07_benchmark"]
+    assert all(table.note.str.contains("does not open"))
 
 
 @pytest.mark.verify
@@ -163,6 +181,10 @@ def test_a_class_of_all_sorts(course, tmp_path):
     deleted = solved()
     deleted.cells = [cell for cell in deleted.cells if classroom.task_of(cell) != "explain-check"]
     hand_in(folder, "jan", deleted)
+    cheating = solved(explain="def check(*_, **__):\n    pass")
+    cheating.cells = [cell for cell in cheating.cells if classroom.task_of(cell) != "setup"]
+    hand_in(folder, "kai", cheating)
+    hand_in(folder, "leo", solved(mix="import os\nos._exit(1)"))
     shutil.copytree(folder / "ben", folder / "late" / "ben")
     hand_in(folder, "ida", solved("07_benchmark"), "07_benchmark.ipynb")
     table = pd.read_csv(classroom.grade(course, folder), keep_default_na=False).set_index("student")
@@ -170,19 +192,21 @@ def test_a_class_of_all_sorts(course, tmp_path):
     earned = {name: float(value) for name, value in table.points.items() if value != ""}
     assert earned == {
         "ada": full, "dora": full - points["mix"], "emil": full - points["explain"], "fay": full, "gil": full,
-        "ida": 12, "jan": full,
+        "ida": 12, "jan": full, "kai": full - points["explain"],
     }  # fmt: skip
     notes = {
         "ben": "handed in 2 times",
         "cleo": "does not open",
         "fay": "more than once",
         "hal": "is no exercise",
-        "jan": "missing: explain-check; checks were put back",
+        "jan": "missing: explain-check (put back)",
+        "kai": "missing: setup (put back)",
+        "leo": "not graded: its code ended Python",
     }
     assert {name: note for name, note in table.note.items() if note}.keys() == notes.keys()
     assert all(words in table.note[name] for name, words in notes.items())
     pages = Counter(path.parts[-3] for path in (course / "feedback").rglob("*.html"))
-    assert pages == Counter(["ada", "dora", "emil", "fay", "gil", "ida", "jan"])
+    assert pages == Counter(["ada", "dora", "emil", "fay", "gil", "ida", "jan", "kai"])
     for page in (course / "feedback").rglob("*.html"):
         assert "HIDDEN TESTS" not in page.read_text()
     shutil.rmtree(folder / "late")
@@ -190,8 +214,11 @@ def test_a_class_of_all_sorts(course, tmp_path):
     assert float(table.points["ben"]) == 0
     other = tmp_path / "other"
     hand_in(other, "kim", "this is no notebook")
+    hand_in(other, "ada", "this is no notebook")
     table = pd.read_csv(classroom.grade(course, other), keep_default_na=False).set_index("student")
     assert {"cleo", "kim"} <= set(table.index[table.note != ""]), "notes of other folders stay"
+    assert "the points are of an earlier hand-in" in table.note["ada"]
+    assert float(table.points["ada"]) == full
     with classroom._nbgrader(course).gradebook as book:
         book.find_grade("open", LESSON, LESSON, "ada").manual_score = 1.5
         book.db.commit()
