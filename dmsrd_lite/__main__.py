@@ -68,10 +68,9 @@ def _validate(arguments: argparse.Namespace) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     from dmsrd_lite.workbook.plans import load_plan, run_plan
 
-    options = {
-        name: getattr(arguments, name) for name in ("workers", "scheduler", "only", "force", "dry_run")
-    }
-    return 0 if run_plan(load_plan(arguments.plan, arguments.output), **options) else 1
+    options = {name: getattr(arguments, name) for name in ("scheduler", "only", "force", "dry_run")}
+    workers, plan = check_whole(arguments.workers, "workers"), load_plan(arguments.plan, arguments.output)
+    return 0 if run_plan(plan, workers=workers, **options) else 1
 
 
 def _results(arguments: argparse.Namespace) -> int:
@@ -84,7 +83,7 @@ def _results(arguments: argparse.Namespace) -> int:
 def _bench(arguments: argparse.Namespace) -> int:
     from dmsrd_lite.workbook.bench import bench
 
-    n_iterations = check_whole(arguments.iterations, "iterations", 2)
+    n_iterations = check_whole(arguments.iterations, "iterations", 2)  # the first is start-up
     n_from_nothing = check_whole(arguments.from_nothing, "from-nothing")
     result = bench(check_whole(arguments.seed, "seed"), n_iterations, n_from_nothing)
     print(json.dumps(result, indent=None if arguments.json else 1))
@@ -148,16 +147,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _whole(name: str, least: int) -> Callable[[str], int]:
-    def check(value: str) -> int:
-        try:
-            return check_whole(value, name, least)
-        except InputError as error:  # argparse would say only that it is invalid
-            raise argparse.ArgumentTypeError(str(error)) from None
-
-    return check
-
-
 def _add_data(command: _Adds) -> None:
     text = "train demonstrators; write them, what they show, a stream and test sets"
     generate = command("generate", _generate, text)
@@ -172,9 +161,9 @@ def _add_data(command: _Adds) -> None:
     convert.add_argument("file", help="where to write the demonstration file (.npz)")
     convert.add_argument("--domain", default="", help="(default: the one whose states are as wide)")
     text = "so many episodes in a row are one person's (default: 1)"
-    convert.add_argument("--each", type=_whole("each", 1), default=1, help=text)
-    text = "only the first so many steps of every episode (default: all)"
-    convert.add_argument("--steps", type=_whole("steps", 0), default=0, help=text)
+    convert.add_argument("--each", default="1", help=text)
+    text = "only the first so many steps of every episode (default: 0, all)"
+    convert.add_argument("--steps", default="0", help=text)
     validate = command("validate", _validate, "say what is wrong with a demonstration or test file")
     validate.add_argument("files", nargs="+")
 
@@ -182,8 +171,8 @@ def _add_data(command: _Adds) -> None:
 def _add_runs(command: _Adds) -> None:
     run = command("run", _run, "run what is left of a plan: one notebook, or several, with many parameters")
     run.add_argument("plan", help="a .toml file, as in papermill_runs/plans")
-    text = "processes on this machine (default: one for every two cores)"
-    run.add_argument("--workers", type=_whole("workers", 1), default=0, help=text)
+    text = "processes on this machine (default: 0, one for every two cores)"
+    run.add_argument("--workers", default="0", help=text)
     text = "address of a Dask scheduler, as tcp://host:8786, to run there"
     run.add_argument("--scheduler", default="", help=text)
     text = "only runs with this parameter"

@@ -322,13 +322,17 @@ def check_folder(path: str | Path) -> Path:
     return path
 
 
-def write_atomically(path: str | Path, write: Callable[[IO[bytes]], object]) -> Path:
-    """``write(binary file)`` on a temporary file, renamed to ``path``: the old file or the whole new one."""
+def write_atomically(path: str | Path, content: bytes | Callable[[IO[bytes]], object]) -> Path:
+    """Bytes, or ``content(binary file)``, in a temporary file, renamed to ``path``: the old file or the whole
+    new one."""
     path = check_folder(path)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
-            write(file)
+            if isinstance(content, bytes):
+                file.write(content)
+            else:
+                content(file)
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException as error:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from pathlib import Path
 
 import nbformat
 import pytest
@@ -172,6 +173,19 @@ def test_somebody_steers_by_the_keyboard_and_is_recorded(browser, server):
     asked = nbformat.read(opened.path, 4).cells[steering + 2]
     assert asked.execution_count
     assert not asked.outputs  # else: nobody steers
+    (play,) = (i for i, cell in enumerate(cells) if "lessons.slider(play" in cell.source)
+    for k in range(play - 3, play + 1):
+        page.evaluate(activate, k)
+        opened.do("notebook:run-cell")
+    shares = page.locator(".jp-CodeCell", has_text="lessons.slider(play").first
+    shares.locator("select").scroll_into_view_if_needed()
+    opened.picture("play")
+    widths = "all => all.map(one => one.getBoundingClientRect().width)"
+    tracks = shares.locator(".noUi-target").evaluate_all(widths)
+    assert len(tracks) == 5
+    assert min(tracks) > 100, "a track that a mouse can move along"
+    cell, choice = shares.bounding_box(), shares.locator("select").bounding_box()
+    assert choice["x"] + choice["width"] <= cell["x"] + cell["width"]
     page.close()
 
 
@@ -194,15 +208,32 @@ def test_a_link_leads_to_the_next_lesson_and_a_wrong_parameter_to_one_sentence(b
     assert "pendulm" in sentence
     assert all("is not defined" in one for one in later), "a cell may run before JupyterLab cancels it"
     assert len(sentence.splitlines()) == 1
-    opened.page.locator(".jp-Notebook .jp-OutputArea", has_text=sentence).first.scroll_into_view_if_needed()
+    said = opened.page.locator(".jp-Notebook .jp-OutputArea", has_text=sentence).first
+    opened.page.wait_for_timeout(1500)  # the notebook scrolls by itself
+    said.scroll_into_view_if_needed()
+    opened.page.wait_for_timeout(500)
+    assert said.is_visible()
     opened.picture("wrong_parameter")
     opened.page.close()
 
 
-def test_the_book_opens_without_a_network(browser, tmp_path):
-    executed = book.EXECUTED if all((book.EXECUTED / p.name).exists() for p in book.lessons()) else NOTEBOOKS
-    first = book.make_book(executed, tmp_path)
+def test_the_book_opens_without_a_network(browser, server, tmp_path):
+    executed, name = Path(shutil.copytree(NOTEBOOKS, tmp_path / "executed")), "00_start_here.ipynb"
+    shutil.copyfile(NOTEBOOKS / name, server[0] / name)  # another test typed something wrong into it
+    opened = Opened(browser, server, "00_start_here")
+    opened.run_all()
+    opened.page.close()
+    shutil.copyfile(opened.path, executed / name)
+    first = book.make_book(executed, tmp_path / "book")
     page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((first.parent / "00_start_here.html").as_uri())
+    assert all(page.locator("main img").evaluate_all("all => all.map(one => one.alt.length > 20)"))
+    assert page.locator("main img").count()
+    assert page.locator("main video").count()
+    page.locator("main video").first.scroll_into_view_if_needed()
+    page.screenshot(path=PICTURES / "book_video.png")
+    page.goto((first.parent / "exercise_02_airl.html").as_uri())
+    assert not page.locator("details pre").first.is_visible()
     asked = []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(first.as_uri())

@@ -27,7 +27,7 @@ from helpers import untrained_set
 shown, found = untrained_set(INVERTED_PENDULUM), []
 for n in (1, 2):
     torch.set_num_threads(n)
-    cloned, _ = clone_demonstrations(shown, 0, n_steps=50)
+    cloned = clone_demonstrations(shown, 0, n_steps=50)
     learner = AIRL(shown, AIRLSettings(n_iterations=2, episodes=2, cloning_steps=50, replay_samples=100), 0)
     list(learner.train())
     evaluated = learner.averaged_rewards.evaluate(shown.observations)

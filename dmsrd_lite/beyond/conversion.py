@@ -14,6 +14,7 @@ import numpy as np
 
 from dmsrd_lite.demonstrations import DemonstrationSet, read_arrays
 from dmsrd_lite.domains import DOMAINS, Domain, InputError
+from dmsrd_lite.domains.domain import check_whole
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ def convert(
     episode; 0: all. ``InputError`` for what cannot be used: episodes of different lengths, that ended early,
     without actions, of another domain.
     """
-    path = Path(source).resolve()
+    path, each, steps = Path(source).resolve(), check_whole(each, "each", 1), check_whole(steps, "steps")
     episodes, together = _episodes(path)
     if together and each not in (1, together):
         text = f"has four axes, {together} episodes for each person"
@@ -90,8 +91,8 @@ def _domain_of(path: Path, episode: Episode) -> Domain:
 
 def _fault(episode: Episode, domain: Domain, steps: int, n_states: int) -> str:
     """What is wrong with an episode; nothing if it can be used."""
-    states, actions = episode.observations, episode.actions
-    if actions is None:
+    states, actions, rewards = episode.observations, episode.actions, episode.rewards
+    if actions is None or not len(actions):
         return "has no actions; expected the executed action of every step"
     t = len(actions)
     if states.ndim != 2 or len(states) not in (t, t + 1) or states.shape[1] != domain.obs_dim:
@@ -100,8 +101,10 @@ def _fault(episode: Episode, domain: Domain, steps: int, n_states: int) -> str:
     if actions.shape != (t, domain.action_dim):
         wanted = f"({t}, {domain.action_dim}) of {domain.name}"
         return f"has actions of shape {actions.shape}; expected {wanted}"
-    for name, part in (("observations", states), ("actions", actions)):
-        if fault := _no_number(part[: steps + 1] if steps else part, name):
+    if rewards is not None and rewards.shape != (t,):
+        return f"has rewards of shape {rewards.shape}; expected ({t},)"
+    for name, part in (("observations", states), ("actions", actions), ("rewards", rewards)):
+        if part is not None and (fault := _no_number(part[: steps + 1] if steps else part, name)):
             return fault
     if steps:
         short = t < steps or len(states) <= steps
@@ -120,12 +123,13 @@ def _fault(episode: Episode, domain: Domain, steps: int, n_states: int) -> str:
 
 
 def _no_number(array: np.ndarray, name: str) -> str:
-    """What is no finite number in an episode's array (steps, dimension), and where."""
+    """What is no finite number in an episode's array (steps, dimension) or (steps,), and where."""
     if array.dtype.kind not in "fiub":
         return f"{name}: has type {array.dtype}; expected numbers"
-    wrong = np.argwhere(~np.isfinite(array))
-    where = f"step {wrong[0][0]}, coordinate {wrong[0][1]}" if len(wrong) else ""
-    return f"{name}: holds NaN or infinity, first at {where}; expected finite numbers" if where else ""
+    for step, *coordinate in np.argwhere(~np.isfinite(array)):
+        where = f"step {step}" + "".join(f", coordinate {i}" for i in coordinate)
+        return f"{name}: holds NaN or infinity, first at {where}; expected finite numbers"
+    return ""
 
 
 def _episodes(path: Path) -> tuple[list[Episode], int]:
@@ -167,8 +171,10 @@ def _from_arrays(path: Path) -> tuple[list[Episode], int]:
             raise InputError(f"{path}: {name}: has shape {arrays[name].shape}; expected ({wanted})")
     n, names = int(np.prod(lead)), ("observations", "actions", "rewards", "reset_seeds")
     flat = [arrays[k].reshape(n, *arrays[k].shape[len(lead) :]) if k in arrays else [None] * n for k in names]
-    ended = np.atleast_1d(arrays.get("terminations", np.zeros(n)).reshape(n, -1).any(1))
-    parts = zip(*flat, ended, strict=True)
+    ended, t = arrays.get("terminations", np.zeros(lead)), arrays.get("actions", states).shape[-2]
+    if ended.shape not in (lead, (*lead, t)):
+        raise InputError(f"{path}: terminations: has shape {ended.shape}; expected {lead} or {(*lead, t)}")
+    parts = zip(*flat, (bool(one.any()) for one in ended.reshape(n, -1)), strict=True)
     return [Episode(*part) for part in parts], lead[1] if len(lead) == 2 else 0
 
 
@@ -184,7 +190,7 @@ def _from_minari(folder: Path) -> list[Episode]:
         raise InputError(f"{folder}: {what}; expected a whole Minari dataset") from None
     if any(isinstance(e.observations, dict | tuple) for e in episodes):
         raise InputError(f"{folder}: observations have parts; expected one vector for every step")
-    return [_episode(e.observations, e.actions, e.rewards, np.any(e.terminations)) for e in episodes]
+    return [Episode(e.observations, e.actions, e.rewards, over=any(e.terminations)) for e in episodes]
 
 
 def _from_saved_trajectories(folder: Path) -> list[Episode]:
@@ -202,15 +208,11 @@ def _from_saved_trajectories(folder: Path) -> list[Episode]:
                 cells = {name: table[name][row] for name in table.column_names}
                 acts, rews = (_array(cells[k]) if k in cells else None for k in ("acts", "rews"))
                 over = "terminal" in cells and cells["terminal"].as_py()
-                found.append(_episode(_array(cells["obs"]), acts, rews, over))
+                found.append(Episode(_array(cells["obs"]), acts, rews, over=over))
         return found
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArrowInvalid) as error:
         what = f"cannot be read ({type(error).__name__})"
         raise InputError(f"{folder}: {what}; expected trajectories with obs and acts") from None
-
-
-def _episode(states: Any, actions: Any, rewards: Any, over: Any) -> Episode:
-    return Episode(states, actions, rewards, over=bool(over))
 
 
 def _array(cell: Any) -> np.ndarray:

@@ -20,24 +20,24 @@ from dmsrd_lite.method.policy_mixture import Mixtures, MixtureSettings, likelies
 OUTSIDE = 1.0  # nats above the own second take: who is nearer to mixtures of the others is one of them
 DRAWS, FINALISTS = 5000, 4  # of sets of people
 SEARCH = MixtureSettings(24, 16)  # for the mixture of the others that is nearest to somebody
+N_SHOWN = 3  # trajectories of each person
 TRIALS = 20  # from fresh starts, in which nobody may fail
 
 
 def good_flights(
-    domain: Domain, actor: Policies, settings: DiaynSettings, n_shown: int, seed: int
+    domain: Domain, actor: Policies, settings: DiaynSettings, seed: int
 ) -> tuple[np.ndarray, list[DemonstrationSet]]:
-    """Which starts are good, (m, starts) bool, and two takes of every policy from its first ``n_shown`` good
+    """Which starts are good, (m, starts) bool, and two takes of every policy from its first ``N_SHOWN`` good
     ones.
 
     A start is good if the trajectories of both takes return at least ``domain.success_return`` and do not
     fail.
     """
-    starts = draw_reset_seeds(
-        np.random.default_rng([seed, 7]), actor.n_strategies, n_shown * settings.attempts
-    )
+    rng = np.random.default_rng([seed, 7])
+    starts = draw_reset_seeds(rng, actor.n_strategies, N_SHOWN * settings.attempts)
     tried = [rollout(domain, actor, starts.shape[1], [seed, 8, take], reset_seeds=starts) for take in (0, 1)]
     good = np.all([(data.returns >= domain.success_return) & ~data.failed.any(-1) for data in tried], axis=0)
-    first = np.argsort(~good, axis=1, kind="stable")[:, :n_shown]
+    first = np.argsort(~good, axis=1, kind="stable")[:, :N_SHOWN]
     return good, [demonstrations_from(data.select_episodes(first), actor) for data in tried]
 
 
@@ -117,7 +117,7 @@ def successful(
     and a clone that fails no more often than 1 time in 20.
     """
     fails = rollout(domain, actor, TRIALS, [seed, 9]).failed.any(-1).mean(1)
-    clones = clone_demonstrations(shown, [seed, 11], n_steps=2000)[0].actor()
+    clones = clone_demonstrations(shown, [seed, 11], n_steps=2000).actor()
     clones_fail = rollout(domain, clones, TRIALS, [seed, 12]).failed.any(-1).mean(1)
     fits = (good.sum(1) >= shown.actions.shape[1]) & (clones_fail - fails <= 0.05)
     return np.flatnonzero(fits & (domain.comparison.matched_starts | (fails == 0))), clones
@@ -146,14 +146,14 @@ def searched_for(clones: Actor, shown: DemonstrationSet, seed: list[int]) -> np.
 
 
 def choose_demonstrators(
-    domain: Domain, actor: Actor, settings: DiaynSettings, seed: int, n_kept: int, n_trajectories: int = 3
+    domain: Domain, actor: Actor, settings: DiaynSettings, seed: int, n_kept: int
 ) -> tuple[np.ndarray, list[DemonstrationSet], dict]:
     """The most different of the successful policies: their indices, two takes of them, and the choice for the
     metadata.
 
     ``successful``, then ``choose_different``. ``InputError`` when too few are left.
     """
-    good, takes = good_flights(domain, actor, settings, n_trajectories, seed)
+    good, takes = good_flights(domain, actor, settings, seed)
     able, clones = successful(domain, actor, takes[0], good, seed)
     takes, clones = [take.select(able) for take in takes], clones.select(able)
     people = [diversity_of(domain).describe(shown) for shown in takes[0].observations]

@@ -15,9 +15,7 @@ from dmsrd_lite.learning.networks import BatchedMLP, one_thread, to_tensor
 from dmsrd_lite.learning.policy_optimization import TrainingSettings, train_policies
 from dmsrd_lite.learning.rollouts import Rollouts
 
-POPULATION_SEED = (
-    3000  # added to a generation's seed for each further population, so that trainings share nothing
-)
+POPULATION_SEED = 3000  # added to a generation's seed for each further population: they share nothing
 
 
 @dataclass(frozen=True)

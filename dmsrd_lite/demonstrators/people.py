@@ -26,7 +26,7 @@ def save_demonstrators(path: str | Path, actor: Actor, made_with: str = "") -> P
 
     header = {"format": _FORMAT, "domain": actor.domain.name, "made_with": made_with}
     binary = save({k: np.ascontiguousarray(v) for k, v in actor.arrays().items()}, metadata=header)
-    return write_atomically(path, lambda file: file.write(binary))
+    return write_atomically(path, binary)
 
 
 def load_demonstrators(path: str | Path, domain: Domain, n_people: int = 0) -> tuple[Actor, str]:

@@ -60,9 +60,7 @@ def generate_test_set(
         quality.append(
             np.where(fails & (returns < domain.poor_return), 0, 1 + (returns >= domain.success_return))
         )
-    moments = np.array(
-        [spread_moments(of_one, n_snapshots) for of_one in np.transpose(quality)]
-    )  # (M, n_snapshots)
+    moments = np.array([spread_moments(q, n_snapshots) for q in np.transpose(quality)])  # (M, n_snapshots)
     parts: dict[str, list] = {"observations": [], "failed": [], "returns": [], "returns_every_step": []}
     for k in progress(range(n_snapshots)):
         actor = Actor.joined([actors[moment].select([j]) for j, moment in enumerate(moments[:, k])])

@@ -15,7 +15,7 @@ from dmsrd_lite.demonstrations import (
     plain,
     save_demonstrations,
 )
-from dmsrd_lite.demonstrators.choice import choose_demonstrators, good_flights
+from dmsrd_lite.demonstrators.choice import N_SHOWN, choose_demonstrators, good_flights
 from dmsrd_lite.demonstrators.diayn import POPULATION_SEED, DiaynSettings, diversity_of, train_demonstrators
 from dmsrd_lite.demonstrators.people import load_demonstrators, save_demonstrators
 from dmsrd_lite.domains import Domain, InputError
@@ -27,7 +27,7 @@ LIFELONG_SEED = 5000  # added to a generation's seed for the mixtures
 
 
 def train_all_demonstrators(
-    domain: Domain, settings: DiaynSettings, seed: int, folder: Path | None = None, progress: Callable = iter
+    domain: Domain, settings: DiaynSettings, seed: int, folder: Path, progress: Callable
 ) -> Actor:
     """The policies of all of the domain's populations, as they act when they demonstrate.
 
@@ -36,14 +36,13 @@ def train_all_demonstrators(
     actors = []
     for number, population in enumerate(diversity_of(domain).populations):
         made_with = json.dumps(plain({"seed": seed, "population": asdict(population), **asdict(settings)}))
-        path = None if folder is None else folder / f"{domain.name}_population_{number}.safetensors"
-        known = load_demonstrators(path, domain) if path is not None and path.exists() else None
+        path = folder / f"{domain.name}_population_{number}.safetensors"
+        known = load_demonstrators(path, domain) if path.exists() else None
         if known is None or known[1] != made_with:
             own_seed = seed + number * POPULATION_SEED
             *_, last = progress(train_demonstrators(domain, population, settings, own_seed))
             known = last["policies"].actor(), made_with
-            if path is not None:
-                save_demonstrators(path, *known)
+            save_demonstrators(path, *known)
         actors.append(known[0])
     actor = Actor.joined(actors)
     return actor.select(np.arange(actor.n_strategies), settings.acting_noise)
@@ -56,7 +55,6 @@ def generate_demonstrations(
     folder: Path,
     *,
     n_kept: int = 10,
-    n_trajectories: int = 3,
     progress: Callable = iter,
 ) -> dict:
     """Train demonstrators, choose among them (``choose_demonstrators``), write them, their demonstrations and
@@ -68,7 +66,7 @@ def generate_demonstrations(
     takes = ("demonstrations", "second_take")
     paths = {take: check_folder(folder / f"{domain.name}_{take}.npz") for take in takes}
     actor = train_all_demonstrators(domain, settings, seed, folder / ".populations", progress)
-    kept, shown, choice = choose_demonstrators(domain, actor, settings, seed, n_kept, n_trajectories)
+    kept, shown, choice = choose_demonstrators(domain, actor, settings, seed, n_kept)
     made_by = f"python -m dmsrd_lite generate {domain.name} --seed {seed}"
     metadata = {"seed": seed, "choice": choice, "settings": asdict(settings), "made_by": made_by}
     save_demonstrators(folder / f"{domain.name}_demonstrators.safetensors", actor.select(kept), made_by)
@@ -78,13 +76,7 @@ def generate_demonstrations(
 
 
 def draw_mixtures(
-    domain: Domain,
-    actor: Actor,
-    settings: DiaynSettings,
-    seed: int,
-    n_mixtures: int,
-    least_return: float,
-    n_trajectories: int = 3,
+    domain: Domain, actor: Actor, settings: DiaynSettings, seed: int, n_mixtures: int, least_return: float
 ) -> tuple[np.ndarray, list[DemonstrationSet], int]:
     """Users who are mixtures of an actor's policies: weights (n, M) from Dirichlet(1), two takes, how many
     were redrawn.
@@ -95,12 +87,10 @@ def draw_mixtures(
     weights, parts = np.zeros((0, actor.n_strategies)), []
     while len(weights) < n_mixtures:
         drawn = rng.dirichlet(np.ones(actor.n_strategies), n_mixtures - len(weights))
-        good, shown = good_flights(
-            domain, Mixtures(actor, drawn), settings, n_trajectories, seed + 1 + n_redrawn
-        )
+        good, shown = good_flights(domain, Mixtures(actor, drawn), settings, seed + 1 + n_redrawn)
         returns = shown[0].returns
         assert returns is not None
-        fits = (good.sum(1) >= n_trajectories) & (returns.mean(1) >= least_return)
+        fits = (good.sum(1) >= N_SHOWN) & (returns.mean(1) >= least_return)
         if not fits.any() and n_redrawn > 10 * n_mixtures:
             text = "failed one after the other; expected base policies that mix well"
             raise InputError(f"{n_redrawn} mixtures of {domain.name} {text}")

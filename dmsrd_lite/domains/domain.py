@@ -44,12 +44,10 @@ class StateComparison:
 
     coordinates: tuple[int, ...] = ()  # those that count; (): all
     resolution: float = 1e-9  # distances below this are the noise of the recording
-    matched_starts: bool = (
-        False  # starts differ more than strategies do: pool trajectories, roll out from the same starts
-    )
-    alike: Callable[[np.ndarray], np.ndarray] | None = (
-        None  # states in which everybody is alike, as a lander on its legs: (..., obs_dim) -> (...) bool
-    )
+    # Starts differ more than strategies do: pool trajectories, roll out from the same starts.
+    matched_starts: bool = False
+    # States in which everybody is alike, as a lander on its legs: (..., obs_dim) -> (...) bool.
+    alike: Callable[[np.ndarray], np.ndarray] | None = None
     own_at_most: float = 1.0  # nats between one demonstrator's own trajectories ...
     others_at_least: float = 3.0  # ... and between two demonstrators
 
@@ -76,15 +74,11 @@ class Population:
 class Diversity:
     """How people differ (``demonstrators.diayn``)."""
 
-    features: Callable[
-        [np.ndarray], np.ndarray
-    ]  # (..., T+1, obs_dim) -> (..., T, n): what a spectator would see
+    features: Callable[[np.ndarray], np.ndarray]  # (..., T+1, obs_dim) -> (..., T, n): what a spectator sees
     feature_names: tuple[str, ...]
     populations: tuple[Population, ...]  # demonstrators are chosen from all of these ...
     test_population: Population  # ... and the test sets for rewards are made by this one
-    describe: Callable[
-        [np.ndarray], dict[str, Any]
-    ]  # one person's (k, T+1, obs_dim) -> numbers and a ``kind``
+    describe: Callable[[np.ndarray], dict[str, Any]]  # a person's (k, T+1, obs_dim) -> numbers, a ``kind``
 
 
 @dataclass(frozen=True)
@@ -103,19 +97,15 @@ class Domain:
     horizon: int  # steps of every episode
     seconds_per_step: float
     observation_names: tuple[str, ...]  # with units
-    observation_low: tuple[
-        float, ...
-    ]  # networks see observations clipped to these bounds; files stay raw ...
+    observation_low: tuple[float, ...]  # networks see observations clipped to these bounds ...
     observation_high: tuple[float, ...]
-    observation_scale: tuple[float, ...]  # ... and divided by this
+    observation_scale: tuple[float, ...]  # ... and divided by this; files stay raw
     action_names: tuple[str, ...]
     action_low: tuple[float, ...]
     action_high: tuple[float, ...]
     reward_text: str
     failure_text: str  # the word used in tables, as "falls"
-    failed: Callable[
-        [np.ndarray, np.ndarray], np.ndarray
-    ]  # new states (..., obs_dim), rewards (...) -> bool (...)
+    failed: Callable[[np.ndarray, np.ndarray], np.ndarray]  # new states (..., obs_dim), rewards -> (...) bool
     success_return: float  # whoever can do the task reaches at least this
     simulator: Simulator
     poor_return: float = float("inf")  # who fails and returns less has hardly begun to learn
@@ -161,15 +151,14 @@ class Domain:
         return np.clip(actions, self.action_low, self.action_high)
 
 
-def check_whole(value: object, name: str, least: int = 0, most: float = float("inf")) -> int:
-    """``value`` as an int, or ``InputError`` when it is no whole number from ``least`` to ``most``."""
+def check_whole(value: object, name: str, least: int = 0) -> int:
+    """``value`` as an int, or ``InputError`` when it is no whole number of at least ``least``."""
     try:
         number = int(str(value))
     except ValueError:
         number = least - 1
-    if not least <= number <= most:
-        bounds = f"of at least {least}" if most == float("inf") else f"from {least} to {most}"
-        raise InputError(f"{name} {value!r}: expected a whole number {bounds}")
+    if number < least:
+        raise InputError(f"{name} {value!r}: expected a whole number of at least {least}")
     return number
 
 

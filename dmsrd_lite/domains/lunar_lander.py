@@ -48,9 +48,8 @@ def draw(observation: np.ndarray, height: int = 120, width: int = 150) -> np.nda
     pen.rectangle([0, ground, width * factor, height * factor], fill="#BBBBBB")
     pen.line([8 * unit, ground, 12 * unit, ground], fill="#E69F00", width=2 * factor)
     centre = np.array([(10 + 10 * x) * unit, ground - (6.67 * y + 0.6) * unit])
-    turn = (
-        np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]) * unit * 1.6
-    )  # larger than true
+    turned = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    turn = turned * unit * 1.6  # larger than true
 
     def place(*points: tuple[float, float]) -> list[tuple[float, ...]]:
         return [tuple(centre + turn @ point) for point in np.array(points)]

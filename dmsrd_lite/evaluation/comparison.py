@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from dmsrd_lite.demonstrations import DemonstrationSet, RewardTestSet
+from dmsrd_lite.demonstrations import DemonstrationSet
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.domains.domain import Seed
-from dmsrd_lite.evaluation.metrics import correlations_on, score_policies
+from dmsrd_lite.evaluation.metrics import score_policies
 from dmsrd_lite.learning.networks import GaussianPolicies, under
-from dmsrd_lite.method.airl import AIRL, AIRLSettings
+from dmsrd_lite.method.airl import AIRL, AIRLSettings, clone_demonstrations
 from dmsrd_lite.method.between_class_discrimination import recognized
 from dmsrd_lite.method.dmsrd import DMSRDSettings, learn
 from dmsrd_lite.method.msrd import MSRD, MSRDSettings
 from dmsrd_lite.method.policy_mixture import Mixtures
-from dmsrd_lite.method.rewards import MeanRewards, Rewards
+from dmsrd_lite.method.rewards import MeanRewards, Rewards, StateReward
 from dmsrd_lite.method.state import State
 
 METHODS = (
@@ -43,11 +43,9 @@ class Learned:
 
     policies: GaussianPolicies
     weights: np.ndarray
-    rewards: Rewards | MeanRewards | None = None
+    rewards: StateReward | None = None
     task_part: str = "g"  # the part of the rewards that is to know the task
-    pure: tuple[
-        int, ...
-    ] = ()  # the demonstration of each strategy reward; empty where there are no strategy rewards
+    pure: tuple[int, ...] = ()  # the demonstration of each strategy reward; () where there are none
     steps: int = 0  # environment steps of training, all strategies together
     search_steps: int = 0
     seconds: float = 0.0
@@ -88,7 +86,9 @@ def train_to(
     the settings' own, and in the end, each with the steps per demonstration.
 
     One training, and copies of it that end: with a budget's settings, whose learning rate falls over its
-    second half (``last_rate``), a training is the same to the bit until half of it is spent. DMSRD and
+    second half (``last_rate``), a training is the same to the bit until the iteration that crosses half of
+    it. That one runs at the full rate here, in a training for this budget alone already a little slower: the
+    two are nearly the same, and to the bit where an iteration ends on the half, or no rate falls. DMSRD and
     cloning are known in the end only.
     """
     if method not in METHODS:
@@ -113,9 +113,8 @@ def train_to(
     elif method == "AIRL Single":
         learner = AIRL(shown, settings.airl, seed)
     else:
-        only_clone = replace(settings.airl, n_iterations=0, coverage="none", start="clone")
-        clone = AIRL(shown, only_clone, seed).policies
-        yield 0, Learned(clone, weights, seconds=time.perf_counter() - start)
+        clones = clone_demonstrations(shown, [seed, 101], settings.airl.cloning_steps)  # as AIRL starts from
+        yield 0, Learned(clones, weights, seconds=time.perf_counter() - start)
         return
     seconds = time.perf_counter() - start  # of the start
     for one, curve, own_seconds in _trainings(learner, n, budgets, progress):
@@ -128,7 +127,8 @@ def _trainings(
     learner: AIRL, n: int, budgets: Sequence[int], progress: Callable
 ) -> Iterator[tuple[AIRL, list[list[float]], float]]:
     """``learner`` trained for each of ``budgets`` (``train_to``; ``n`` demonstrations) and to its end, with
-    its curve and seconds: a training, and copies of it from where a budget's rate begins to fall."""
+    its curve and seconds: a training, and copies of it from the end of the iteration in which a budget's rate
+    begins to fall."""
     per_person = len(learner.x) / n  # steps for each demonstration in one of a strategy's
     limit, alike = learner.settings.max_steps, 0.5 if learner.settings.last_rate < 1 else 1.0
     left = [b for b in budgets if not limit or b < limit * per_person]
@@ -159,29 +159,16 @@ def learned_by(state: State) -> Learned:
     return Learned(*known, *spent, seconds, decisions=state.records)
 
 
-def score_method(
-    learned: Learned,
-    shown: DemonstrationSet,
-    again: DemonstrationSet | None,
-    test_set: RewardTestSet | None,
-    seed: Seed,
-) -> dict[str, Any]:
-    """``score_policies`` of what explains each demonstration, and what its rewards know.
-
-    task_correlation: mean over the rewards that are to know the task. recognized, recognized_again: share of
-    strategy rewards that rank their pure demonstration first among all shown, and among the second takes; NaN
-    if there are none.
-    """
-    scores: dict[str, Any] = dict(score_policies(learned.actor(), shown, seed))
-    rewards, nothing = learned.rewards, float("nan")
-    scores |= {"task_correlation": nothing, "recognized": nothing, "recognized_again": nothing}
-    if rewards is not None and test_set is not None:
-        scores["task_correlation"] = float(correlations_on(test_set, rewards, learned.task_part).mean())
-    for name, take in (("recognized", shown), ("recognized_again", again)):
-        if rewards is not None and learned.pure and take is not None:
-            scores[name] = float(recognized(rewards.mean_rewards(take), learned.pure).mean())
+def score_method(learned: Learned, shown: DemonstrationSet, seed: Seed) -> dict[str, Any]:
+    """``score_policies`` of what explains each demonstration, what it took to learn it, and ``recognized``:
+    the share of strategy rewards that rank their pure demonstration first among all shown; NaN if there are
+    none."""
+    known = float("nan")
+    if learned.rewards is not None and learned.pure:
+        known = float(recognized(learned.rewards.mean_rewards(shown), learned.pure).mean())
     return {
-        **scores,
+        **score_policies(learned.actor(), shown, seed),
+        "recognized": known,
         "steps": learned.steps,
         "search_steps": learned.search_steps,
         "seconds": learned.seconds,
@@ -197,7 +184,7 @@ def restore(
     policies, found = GaussianPolicies(shown.domain, m, 0), under("reward", tensors)
     n_iterates = len({name.split(".")[1] for name in found if name.startswith("iterates.")})
     several = [Rewards(shown.domain, m, 0.99, 0, alpha) for _ in range(n_iterates or 1)]
-    rewards = MeanRewards(several) if n_iterates else several[0]
+    rewards: StateReward = MeanRewards(several) if n_iterates else several[0]
     modules: list[tuple[str, torch.nn.Module]] = [("policy", policies), ("reward", rewards)]
     for name, module in modules:
         kept = {k: torch.tensor(v) for k, v in under(name, tensors).items()}

@@ -11,7 +11,7 @@ from dmsrd_lite.domains.domain import Seed, extend
 from dmsrd_lite.learning.networks import SIGMA_FLOOR, Policies, one_thread, to_tensor
 from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method.divergence import demonstration_divergence, policy_divergences
-from dmsrd_lite.method.rewards import MeanRewards, Rewards
+from dmsrd_lite.method.rewards import Rewards, StateReward
 
 
 def demonstration_log_likelihood(actor: Policies, demonstrations: DemonstrationSet) -> np.ndarray:
@@ -115,14 +115,14 @@ def one_line_rewards(test_set: RewardTestSet) -> dict[str, np.ndarray]:
     return found if test_set.failed is None else {"has not failed": 1 - test_set.failed.mean(1), **found}
 
 
-def correlations_on(test_set: RewardTestSet, rewards: Rewards | MeanRewards, part: str = "g") -> np.ndarray:
+def correlations_on(test_set: RewardTestSet, rewards: StateReward, part: str = "g") -> np.ndarray:
     """Correlation of each reward, or a ``part`` of it (``Rewards.evaluate``), with the true return: (M,)."""
     means = rewards.evaluate(test_set.observations, part).mean(2)
     return np.array([reward_correlation(mean, test_set.returns) for mean in means])
 
 
 @one_thread()
-def fit_reward(known: RewardTestSet, seed: Seed, n_steps: int = 2000, batch: int = 128) -> Rewards:
+def fit_reward(known: RewardTestSet, seed: Seed, n_steps: int = 2000) -> Rewards:
     """A state reward, the same network as a learned one, fitted to true returns: what any state reward could
     know.
 
@@ -133,7 +133,7 @@ def fit_reward(known: RewardTestSet, seed: Seed, n_steps: int = 2000, batch: int
     rng, rewards = np.random.default_rng(seed), Rewards(known.domain, 1, 0.99, extend(seed, 1))
     x = to_tensor(known.domain.network_input(known.observations))
     target = to_tensor((known.returns - known.returns.mean()) / known.returns.std())
-    held = np.arange(len(target)) % 5 == 0
+    held, batch = np.arange(len(target)) % 5 == 0, 128
     optimizer = torch.optim.Adam(rewards.strategy_reward.parameters(), lr=3e-3, fused=True)
     best, kept = -1.0, rewards.state_dict()
     for step in range(n_steps):

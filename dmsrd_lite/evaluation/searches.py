@@ -32,13 +32,7 @@ def newcomers(people: Actor, n: int, seed: Seed) -> tuple[DemonstrationSet, np.n
 
 
 def compare(
-    finders: dict[str, Finder],
-    people: Actor,
-    known: Actor,
-    n: int,
-    budgets: Sequence[int],
-    seed: Seed,
-    n_rollouts: int = 10,
+    finders: dict[str, Finder], people: Actor, known: Actor, n: int, budgets: Sequence[int], seed: Seed
 ) -> Iterator[dict[str, Any]]:
     """A row for each newcomer, search and budget: ``known`` policies explain mixtures of ``people``.
 
@@ -60,7 +54,7 @@ def compare(
                 rows.append((name, budget, spent, best))
         rows.append(("likeliest actions", 0, 0.0, likeliest_weights(known, one)))
         candidates = np.array([best for *_, best in rows])
-        kl = policy_divergences(Mixtures(known, candidates), one, extend(seed, 4, i), n_rollouts=n_rollouts)
+        kl = policy_divergences(Mixtures(known, candidates), one, extend(seed, 4, i))
         for (name, budget, steps, best), divergence in zip(rows, kl, strict=True):
             row = {"search": name, "newcomer": i, "budget": budget, "steps": steps}
             row["deviation"] = float(deviation)

@@ -65,13 +65,13 @@ def compare_correlations(r_1: float, r_2: float, n_1: int, n_2: int) -> tuple[fl
     return float(z), float(2 * stats.norm.sf(abs(z)))
 
 
-def mean_interval(values: ArrayLike, seed: int = 0, level: float = 0.95) -> tuple[float, float]:
-    """Bootstrap interval of the mean (percentiles, 2,000 draws)."""
+def mean_interval(values: ArrayLike) -> tuple[float, float]:
+    """95 % bootstrap interval of the mean (percentiles, 2,000 draws)."""
     sample = np.asarray(values, dtype=np.float64)
     if sample.ndim != 1 or len(sample) < 2:
         raise InputError(f"values of shape {sample.shape}: expected two or more numbers in a row")
     found = stats.bootstrap(
-        (sample,), np.mean, n_resamples=2000, confidence_level=level, method="percentile",
-        rng=np.random.default_rng(seed),
+        (sample,), np.mean, n_resamples=2000, confidence_level=0.95, method="percentile",
+        rng=np.random.default_rng(0),
     ).confidence_interval  # fmt: skip
     return float(found.low), float(found.high)

@@ -15,9 +15,7 @@ from dmsrd_lite.domains import Domain
 from dmsrd_lite.domains.domain import Seed
 
 LOG_2PI = math.log(2 * math.pi)
-SIGMA_FLOOR = (
-    0.02  # of the action's own unit: no policy gets narrower, and no likelihood is counted with less
-)
+SIGMA_FLOOR = 0.02  # action units: no policy gets narrower, and no likelihood is counted with less
 
 
 @cache

@@ -136,22 +136,14 @@ class TrainingSettings:
 
     n_strategies: int = 10
     n_iterations: int = 120
-    episodes: int = (
-        8  # per policy and iteration at the full horizon; up to four times as many while they are short
-    )
-    first_horizon: int = (
-        100  # steps; grows to the domain's between the shares ``hold`` and ``growing`` of the iterations
-    )
-    hold: float = 0.0
-    growing: float = 0.6
+    episodes: int = 8  # per policy and iteration; up to four times as many while they are short
+    first_horizon: int = 100  # steps; grows to the domain's ...
+    hold: float = 0.0  # ... from this share of the iterations ...
+    growing: float = 0.6  # ... to this one
     first_sigma: float = 0.2  # share of half the action range
-    last_sigma: float = (
-        0.0  # sigma shrinks to this (action units) between 0.4 and 0.9 of the iterations; 0: it is free
-    )
+    last_sigma: float = 0.0  # sigma shrinks to this (action units) from 0.4 to 0.9 of the iterations; 0: free
     last_rate: float = 1.0  # the learning rate falls linearly to this share of itself
-    last_discount: float = (
-        0.0  # the discount grows to this, its distance from 1 by equal factors; 0: it stays
-    )
+    last_discount: float = 0.0  # the discount grows to this, its distance from 1 by equal factors; 0: stays
     ppo: PPOSettings = PPOSettings()
 
 

@@ -26,14 +26,12 @@ WORDS = {  # of the settings that are words
     "start": ("clone", "nothing"),
     "policy_base": ("g", "f"),
     "coverage": ("half", "once", "none"),
-    "penalty_points": ("between", "samples", "demonstrations"),
+    "penalty_points": ("between",),
 }
 ENTROPY_WEIGHTS = (0.002, 0.1)  # within which c is tuned
 REPLAY_SIZE = 100_000  # samples per strategy that a replay of all iterations holds at most
 N_ANCHORS = 4000  # samples per strategy that go on to a later learner
-Samples = tuple[
-    torch.Tensor, torch.Tensor, torch.Tensor
-]  # x (M, n, obs_dim), x' (M, n, obs_dim), log-density (M, n)
+Samples = tuple[torch.Tensor, ...]  # x and x' (M, n, obs_dim), log-density (M, n)
 
 
 @dataclass(frozen=True)
@@ -49,9 +47,7 @@ class AIRLSettings:
     entropy_tuning: float = 0.0  # how fast c follows the demonstrations (``tune_entropy``); 0: not at all
     cloning_weight: float = 1.0  # of the demonstration's negative log-likelihood in a clone's loss
     cloning_steps: int = 2000
-    coverage: str = (
-        "half"  # exploratory rollouts: half of the discriminator's samples, or "once" in the replay
-    )
+    coverage: str = "half"  # exploratory rollouts: half of D's samples, or "once" in the replay, or "none"
     coverage_episodes: int = 2  # of the untrained policy and at each level of the clone (of it, without one)
     coverage_levels: tuple[tuple[float, float], ...] = ()  # as ``Exploration.levels``; (): the domain's
     discriminator_steps: int = 12
@@ -59,10 +55,8 @@ class AIRLSettings:
     discriminator_rate: float = 3e-3
     penalty_weight: float = 0.0  # of the gradient penalty on the reward
     penalty_slope: float = 1.0  # up to which it is free
-    penalty_points: str = "between"  # a demonstration's and a sample's state; or "samples", "demonstrations"
-    first_horizon: int = (
-        0  # episodes grow from so many steps, as the policies earn it; 0: whole from the start
-    )
+    penalty_points: str = "between"  # where it is asked: between a demonstration's and a sample's state
+    first_horizon: int = 0  # episodes grow from so many steps, as the policies earn it; 0: whole at once
     growth: float = 1.05  # of an episode, whenever ...
     grow_below: float = 0.75  # ... the discriminator's smoothed accuracy (its 70 % quantile) is below this
     replay_iterations: int = 10  # policy samples of so many iterations are kept; 0: of all, thinned
@@ -70,9 +64,7 @@ class AIRLSettings:
     anchor_samples: int = 40  # of every iteration, from nothing, for a later learner; 0: the replay's end
     n_iterates: int = 0  # rewards kept for their mean (``mean_of_iterates``), spread over the iterations
     iterates_share: float = 0.5  # which of them are used: the first ones
-    reward_average: float = (
-        0.9  # decay of the running average of the reward's weights; 0 keeps the last iterate
-    )
+    reward_average: float = 0.9  # decay of the running average of the reward's weights; 0 keeps the last
     policy_average: float = 0.0  # decay of the running average of the policies' weights; 0 keeps the last
     last_rate: float = 1.0  # PPO's learning rate falls to this share of itself over the second half
     ppo: PPOSettings = PPOSettings(learning_rate=1e-4, epochs=1, sample_fraction=0.5)
@@ -98,9 +90,8 @@ class AIRLSettings:
 
 def _evenly(samples: Samples, n: int) -> Samples:
     """``n`` of the samples (M, many, ...), evenly spread."""
-    x, x_next, log_pi = samples
-    some = torch.linspace(0, x.shape[1] - 1, n).long()
-    return x[:, some], x_next[:, some], log_pi[:, some]
+    some = torch.linspace(0, samples[0].shape[1] - 1, n).long()
+    return tuple(part[:, some] for part in samples)
 
 
 @torch.no_grad()
@@ -117,24 +108,13 @@ def discriminator_loss(demonstration_logits: torch.Tensor, sample_logits: torch.
     return softplus(-demonstration_logits).mean(1) + softplus(sample_logits).mean(1)
 
 
-def clone_demonstrations(
-    demonstrations: DemonstrationSet,
-    seed: Seed,
-    n_steps: int,
-    streams: tuple[int, int] = (0, 1),
-    progress: Callable = iter,
-) -> tuple[GaussianPolicies, np.ndarray]:
-    """Behavioural cloning of every demonstration: the policies and the curve of the loss
-    (``clone_behavior``).
-
-    ``streams`` of the seed: of the networks' start and of the cloning.
-    """
+def clone_demonstrations(demonstrations: DemonstrationSet, seed: Seed, n_steps: int) -> GaussianPolicies:
+    """A policy for each demonstration by behavioural cloning (``clone_behavior``)."""
     states, actions, _ = demonstrations.transitions()
     x = to_tensor(demonstrations.domain.network_input(states))
-    policies = GaussianPolicies(demonstrations.domain, len(x), extend(seed, streams[0]))
-    stream, acted = extend(seed, streams[1]), to_tensor(actions)
-    curve = clone_behavior(policies, x, acted, stream, n_steps=n_steps, progress=progress)
-    return policies, curve
+    policies = GaussianPolicies(demonstrations.domain, len(x), extend(seed, 0))
+    clone_behavior(policies, x, to_tensor(actions), extend(seed, 1), n_steps)
+    return policies
 
 
 class AIRL:
@@ -165,9 +145,7 @@ class AIRL:
         task_learns: bool = False,
     ):
         self.domain, self.settings = demonstrations.domain, settings
-        self.seed = seed = extend(
-            seed, 101
-        )  # streams of its own: a generator with the same seed shares nothing
+        self.seed = seed = extend(seed, 101)  # of its own: a generator with the same seed shares nothing
         self.horizon = demonstrations.horizon
         states, actions, successors = demonstrations.transitions()
         self.x, self.x_next = (to_tensor(self.domain.network_input(s)) for s in (states, successors))
@@ -200,9 +178,7 @@ class AIRL:
         self.clone: Actor | None = None
         self.untrained = self.policies.actor()
         if networks is None and settings.start == "clone":
-            self.policies, self.cloning_curve = clone_demonstrations(
-                demonstrations, seed, settings.cloning_steps
-            )
+            self.policies = clone_demonstrations(demonstrations, seed, settings.cloning_steps)
             self.clone = self.policies.actor()
         self.averaged_policies = copy.deepcopy(self.policies)
         self.optimizer = PolicyOptimizer(
@@ -238,15 +214,14 @@ class AIRL:
         self.averaged_policies.load_state_dict(self.policies.state_dict())
         for name in ("coverage", "anchors"):
             if f"{name}.0" in networks:
-                x, x_next, log_pi = (networks[f"{name}.{i}"] for i in range(3))
-                setattr(self, name, [(x, x_next, log_pi)])
+                setattr(self, name, [tuple(networks[f"{name}.{i}"] for i in range(3))])
 
     def train(self, progress: Callable = iter) -> Iterator[dict]:
         """Run the iterations that are left; ``progress`` wraps the range (``tqdm`` for a bar).
 
         record: iteration; horizon and number of its episodes; steps (per strategy, coverage included);
-        discriminator_loss, accuracy, environment_return and sigma (M,) each - the return is for reading only
-        and trains nothing; seconds by part.
+        discriminator_loss, accuracy, environment_return and entropy_weight (M,) each - the return is for
+        reading only and trains nothing; seconds by part.
         """
         s = self.settings
         if s.coverage != "none" and not self.coverage and not self.anchors and not self.iteration:
@@ -257,9 +232,8 @@ class AIRL:
             clock = [time.perf_counter()]
             seeds = [[*self.seed, part, iteration] for part in (10, 11, 12, 13)]
             actor, horizon = self.policies.actor(), int(self.length)
-            episodes = max(
-                s.episodes, min(100, s.episodes * self.horizon // (2 * horizon))
-            )  # many, while short
+            many = min(100, s.episodes * self.horizon // (2 * horizon))  # while they are short
+            episodes = max(s.episodes, many)
             data = rollout(self.domain, actor, episodes, seeds[0], horizon=horizon)
             self.steps += data.n_steps // len(self.x)
             clock.append(time.perf_counter())
@@ -294,7 +268,6 @@ class AIRL:
                 "discriminator_loss": loss,
                 "accuracy": accuracy,
                 "environment_return": data.returns.mean(1),
-                "sigma": actor.sigma.mean((1, 2)),
                 "entropy_weight": self.entropy_weights,
                 "seconds": dict(zip(("rollouts", "discriminator", "policy"), np.diff(clock), strict=True)),
             }
@@ -338,14 +311,11 @@ class AIRL:
         """Into the replay; of all iterations' samples every second is dropped whenever they get too many."""
         if self.settings.start == "nothing" and self.settings.anchor_samples:
             self.passed.append(_evenly(new, self.settings.anchor_samples))
-        x, x_next, log_pi = (part[:, :: self.thinning] for part in new)
-        self.replay.append((x, x_next, log_pi))
-        held = sum(x.shape[1] for x, *_ in self.replay)
-        if not self.settings.replay_iterations and held > REPLAY_SIZE:
+        self.replay.append(tuple(part[:, :: self.thinning] for part in new))
+        n_held = sum(x.shape[1] for x, *_ in self.replay)
+        if not self.settings.replay_iterations and n_held > REPLAY_SIZE:
             self.thinning *= 2
-            self.replay = deque(
-                (x[:, ::2], x_next[:, ::2], log_pi[:, ::2]) for x, x_next, log_pi in self.replay
-            )
+            self.replay = deque(tuple(part[:, ::2] for part in held) for held in self.replay)
 
     def _grow(self, accuracy: np.ndarray, iteration: int) -> None:
         """Longer episodes once the discriminator can no longer tell policies from demonstrations."""
@@ -384,8 +354,7 @@ class AIRL:
 
     @staticmethod
     def _joined(sources: Sequence[Samples]) -> Samples:
-        x, x_next, log_pi = (torch.cat(parts, 1) for parts in zip(*sources, strict=True))
-        return x, x_next, log_pi
+        return tuple(torch.cat(parts, 1) for parts in zip(*sources, strict=True))
 
     @one_thread()
     def _discriminate(self, seed: Seed, log_pi: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -433,12 +402,9 @@ class AIRL:
     ) -> torch.Tensor:
         """``E max(0, |d R_j / d x| - slope)^2`` at network inputs x, (M,): shown and samples (M, n, obs_dim).
 
-        ``between``: at random points on the lines between pairs of them (Gulrajani et al., 2017, one-sided).
+        At random points on the lines between pairs of them (Gulrajani et al., 2017, one-sided).
         """
-        share = {"samples": 0.0, "demonstrations": 1.0}.get(self.settings.penalty_points)
-        drawn = (
-            torch.from_numpy(rng.random((*shown.shape[:2], 1), dtype=np.float32)) if share is None else share
-        )
+        drawn = torch.from_numpy(rng.random((*shown.shape[:2], 1), dtype=np.float32))
         x = (drawn * shown + (1 - drawn) * samples).requires_grad_(True)
         slope = torch.autograd.grad(self.rewards.total(x).sum(), x, create_graph=True)[0].norm(dim=-1)
         return (slope - self.settings.penalty_slope).clamp(min=0).square().mean(1)
@@ -465,8 +431,7 @@ class AIRL:
         return self.mean_of_iterates(self.settings.iterates_share) if self.iterates else self.averaged_rewards
 
     def _average(self) -> None:
-        decay = min(
-            self.settings.reward_average, self.n_averaged / (self.n_averaged + 3)
-        )  # forgets the start faster
+        at_first = self.n_averaged / (self.n_averaged + 3)  # forgets the start faster
+        decay = min(self.settings.reward_average, at_first)
         _follow(self.averaged_rewards, self.rewards, decay)
         self.n_averaged += 1

@@ -11,6 +11,7 @@ from dmsrd_lite.learning.networks import one_thread, to_tensor
 from dmsrd_lite.method.rewards import Rewards
 
 N_STATES = 3000  # of each person, on which Equation 4 is asked
+BATCH = 128  # of these, in an update by Equation 4 alone
 
 
 def between_class_loss(mean_rewards: torch.Tensor, weights: torch.Tensor, pure: torch.Tensor) -> torch.Tensor:
@@ -61,17 +62,16 @@ def train_rewards(
     seed: Seed,
     n_updates: int = 400,
     rate: float = 3e-3,
-    batch: int = 128,
 ) -> None:
     """Updates of the strategy rewards by Equation 4 alone, counted from the own demonstration, in place.
 
-    states (n, n_states, obs_dim) of all n people (``states_of``), ``batch`` of each per update; weights (n,
+    states (n, n_states, obs_dim) of all n people (``states_of``), ``BATCH`` of each per update; weights (n,
     M), pure (M,).
     """
     x, w = to_tensor(rewards.domain.network_input(states)), to_tensor(weights)
     own = torch.as_tensor(pure)
     optimizer = torch.optim.Adam(rewards.strategy_reward.parameters(), rate)
-    for some in np.random.default_rng(seed).integers(0, x.shape[1], (n_updates, batch)):
+    for some in np.random.default_rng(seed).integers(0, x.shape[1], (n_updates, BATCH)):
         means = relative_to_own(means_of_people(rewards, x[:, some]), own)
         optimizer.zero_grad()
         between_class_loss(means, w, own).sum().backward()

@@ -30,14 +30,10 @@ AS_PRINTED: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class DMSRDSettings:
-    kl_threshold: float = (
-        0.0  # eps: accept a mixture below this divergence (nats); 0: a reference + kl_margin
-    )
+    kl_threshold: float = 0.0  # eps: a mixture is accepted below it (nats); 0: a reference + kl_margin
     kl_margin: float = 0.5  # nats above the reference (``kl_threshold.reference_divergence``)
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
-    task_learns: bool = (
-        False  # R_Task learns beside a new strategy, and goes 1/M of the way (the paper: rests)
-    )
+    task_learns: bool = False  # R_Task learns beside a new strategy, goes 1/M of the way (the paper: rests)
     between_class: str = "always"  # Equation 4 after every branch, after "mixtures" only (the paper), "never"
     own_rollouts: int = 20  # it is asked on so many of each person's explanation from new starts; 0: on what
     # was shown (the paper)
@@ -100,9 +96,7 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
     s, started, n = settings, time.perf_counter(), len(state.weights)
     state, seed = replace(state, alpha=s.msrd.alpha, form=s.form), [state.seed, 102, n]
     steps = {"search": 0, "airl": 0}  # search: of all rollouts whose KL decides something
-    candidate = cache(
-        partial(_candidate, state, new, s, [*seed, 2])
-    )  # AIRL on tau_i, made when it is asked for
+    candidate = cache(partial(_candidate, state, new, s, [*seed, 2]))  # AIRL on tau_i, made when asked for
     eps, reference = calibrate_threshold(new, candidate, s, [*seed, 7])
     if new.domain.comparison.matched_starts and not s.kl_threshold:  # the reference was flown
         steps["search"] += steps_measured(new, s.mixture.final_rollouts)

@@ -1,13 +1,12 @@
 """The threshold eps of Algorithm 1: below it a mixture explains a demonstration. The paper gives none."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dmsrd_lite.demonstrations import DemonstrationSet
-from dmsrd_lite.method.airl import AIRL
+from dmsrd_lite.method.airl import AIRL, clone_demonstrations
 from dmsrd_lite.method.divergence import own_divergence, policy_divergences
 
 if TYPE_CHECKING:
@@ -36,6 +35,5 @@ def reference_divergence(
     if not comparison.matched_starts:
         own = own_divergence(new.domain, new.observations[0])
         return own if np.isfinite(own) else comparison.own_at_most
-    clone = candidate().clone or AIRL(new, replace(settings.airl, start="clone"), seed).clone
-    assert clone is not None
+    clone = candidate().clone or clone_demonstrations(new, [*seed, 101], settings.airl.cloning_steps).actor()
     return float(policy_divergences(clone, new, seed, n_rollouts=settings.mixture.final_rollouts)[0])

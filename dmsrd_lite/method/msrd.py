@@ -23,18 +23,15 @@ from dmsrd_lite.method.between_class_discrimination import (
     relative_to_own,
 )
 
-Between = tuple[
-    np.ndarray, np.ndarray, Sequence[int] | np.ndarray
-]  # states of all n (n, k, obs_dim), weights (n, M), pure (M,)
+# States of all n (n, k, obs_dim), weights (n, M), pure (M,).
+Between = tuple[np.ndarray, np.ndarray, Sequence[int] | np.ndarray]
 
 
 @dataclass(frozen=True)
 class MSRDSettings(AIRLSettings):
     alpha: float = 0.3  # of Equation 1, in the sum and in the penalty
     between_class_weight: float = 10.0  # of Equation 4, where there are weights to discriminate by
-    between_class_relative: bool = (
-        True  # count each strategy reward from its own demonstration (``relative_to_own``)
-    )
+    between_class_relative: bool = True  # strategy rewards count from their own people (``relative_to_own``)
     between_class_batch: int = 128  # states of every demonstration per step
     between_class_extra: int = 10  # further updates of the strategy rewards after training (``settle``)
 

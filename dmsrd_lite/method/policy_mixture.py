@@ -58,9 +58,7 @@ class MixtureSettings:
     n_finalists: int = 6
     final_rollouts: int = 10  # of the protocol (``policy_divergences``)
     common: bool = False  # all candidates meet the same starts and the same noise (common random numbers)
-    from_actions: bool = (
-        False  # try ``likeliest_weights`` first; near enough, they save the search (beyond the paper)
-    )
+    from_actions: bool = False  # ``likeliest_weights`` first: near enough, no search (beyond the paper)
 
 
 @dataclass(frozen=True)
@@ -184,7 +182,6 @@ def search_mixture(
     *,
     incumbent: ArrayLike | None = None,
     enough: float = 0.0,
-    measure: Measure = demonstration_divergence,
 ) -> MixtureFit:
     """Random search on the simplex for the mixture whose rollouts are nearest to one demonstration (a set of
     one).
@@ -194,7 +191,7 @@ def search_mixture(
     ``from_actions`` ``likeliest_weights`` are measured first, and taken if they come below ``enough`` nats.
     """
     m, s, rng = actor.n_strategies, settings, np.random.default_rng(seed)
-    search = Search(actor, demonstration, settings, seed, measure)
+    search = Search(actor, demonstration, settings, seed)
     drawn = rng.dirichlet(np.ones(m), s.n_candidates)
     for row in drawn[::2]:  # half of them are sparse: few strategies in a mixture are the common case
         kept = rng.permutation(m)[: 2 + rng.integers(2)]

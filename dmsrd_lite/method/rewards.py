@@ -11,7 +11,23 @@ from dmsrd_lite.domains.domain import Seed, extend
 from dmsrd_lite.learning.networks import BatchedMLP, one_thread, to_tensor
 
 
-class Rewards(torch.nn.Module):
+class StateReward(torch.nn.Module):
+    """What gives a reward of the state: ``Rewards``, their mean, or one of your own (``evaluate``)."""
+
+    domain: Domain
+
+    def evaluate(self, observations: np.ndarray, part: str = "g") -> np.ndarray:
+        """A ``part`` of the reward at raw observations (..., obs_dim): (M, ...)."""
+        raise NotImplementedError
+
+    def mean_rewards(self, demonstrations: DemonstrationSet) -> np.ndarray:
+        """``eta_S-j(tau_i)``, the mean of g_j over demonstration i's states that tell who acts: (M, n)."""
+        tells = demonstrations.domain.tells(demonstrations.observations)  # (n, k, T+1)
+        values = self.evaluate(demonstrations.observations)  # (M, n, k, T+1)
+        return (values * tells).sum((2, 3)) / tells.sum((1, 2))
+
+
+class Rewards(StateReward):
     """Strategy rewards ``g_j(s)``, shaping terms ``h_j(s)`` and, where strategies share one, a task reward.
 
     ``R_j = g_j``, or ``R_j = R_Task + alpha g_j`` with ``alpha`` > 0 (Equation 1); each network is an MLP
@@ -58,17 +74,12 @@ class Rewards(torch.nn.Module):
         """``g``, ``task`` or ``total`` at raw observations (..., obs_dim): (M, ...); the task (1, ...)."""
         x = to_tensor(self.domain.network_input(observations)).view(1, -1, self.domain.obs_dim)
         m = 1 if part == "task" else self.strategy_reward.n_strategies
-        values = [
-            getattr(self, part)(some.expand(m, -1, -1)) for some in x.split(100_000, dim=1)
-        ]  # bounded memory
+        parts = x.split(100_000, dim=1)  # bounded memory
+        values = [getattr(self, part)(some.expand(m, -1, -1)) for some in parts]
         return torch.cat(values, 1).numpy().reshape(m, *observations.shape[:-1])
 
-    def mean_rewards(self, demonstrations: DemonstrationSet) -> np.ndarray:
-        """``eta_S-j(tau_i)``, the mean of g_j over demonstration i's states that tell who acts: (M, n)."""
-        return _mean_over_telling(self, demonstrations)
 
-
-class MeanRewards(torch.nn.Module):
+class MeanRewards(StateReward):
     """The mean of several reward functions, not of their weights: what teaches fresh policies (lesson 02)."""
 
     def __init__(self, iterates: Sequence[Rewards]):
@@ -79,13 +90,3 @@ class MeanRewards(torch.nn.Module):
     def evaluate(self, observations: np.ndarray, part: str = "g") -> np.ndarray:
         """As ``Rewards.evaluate``."""
         return np.mean([rewards.evaluate(observations, part) for rewards in self.each], 0)
-
-    def mean_rewards(self, demonstrations: DemonstrationSet) -> np.ndarray:
-        """As ``Rewards.mean_rewards``."""
-        return _mean_over_telling(self, demonstrations)
-
-
-def _mean_over_telling(rewards: Rewards | MeanRewards, demonstrations: DemonstrationSet) -> np.ndarray:
-    tells = demonstrations.domain.tells(demonstrations.observations)  # (n, k, T+1)
-    values = rewards.evaluate(demonstrations.observations)  # (M, n, k, T+1)
-    return (values * tells).sum((2, 3)) / tells.sum((1, 2))

@@ -86,7 +86,7 @@ def _states(
         actor: Policies = state.mixtures(some)
         if settings.own_clones:
             shown, n_steps = state.shown.select(some), settings.airl.cloning_steps
-            actor = clone_demonstrations(shown, [*seed, 2], n_steps)[0].actor()
+            actor = clone_demonstrations(shown, [*seed, 2], n_steps).actor()
         data = rollout(state.domain, actor, settings.own_rollouts, [*seed, 0])
         observations, steps = data.observations, data.n_steps
     else:

@@ -31,7 +31,7 @@ def save_state(path: str | Path, state: State) -> Path:
               "pure": state.pure, "records": state.records, "alpha": state.alpha, "form": state.form,
               "metadata": state.shown.metadata if known else {}}  # fmt: skip
     binary = save(tensors, metadata={k: json.dumps(plain(v)) for k, v in header.items()})
-    return write_atomically(path, lambda file: file.write(binary))
+    return write_atomically(path, binary)
 
 
 def load_state(path: str | Path, domain: Domain) -> State:
@@ -69,7 +69,8 @@ def learn_stream(
     a copy stays, for ``kept_states``.
 
     Yields the newest state of earlier calls first, if there is one. ``InputError`` when the folder holds
-    another stream, or one of another ``source`` (of the code: ``records.source_hash``).
+    another stream, more of it than ``shown``, or one of another ``source`` (of the code:
+    ``records.source_hash``).
     """
     folder, digests = Path(folder).resolve(), _digests(shown)
     journal, note = check_folder(folder / _JOURNAL), folder / "settings.txt"
@@ -79,23 +80,21 @@ def learn_stream(
         raise InputError(f"{folder}: {text}")
     if state.records and _digests(state.shown) != digests[: len(state.records)]:
         raise InputError("a state that knows other demonstrations; expected those that were shown first")
-    write_atomically(note, lambda file: file.write(made_with.encode()))
+    write_atomically(note, made_with.encode())
     state = max(
         [state, *_found(folder, "checkpoint_*", shown, digests)], key=lambda known: len(known.records)
     )
     n, total = len(state.records), shown.n_demonstrations
     lines = [json.dumps(pair) + "\n" for pair in zip(digests[:n], state.records, strict=True)]
-    write_atomically(journal, lambda file: file.write("".join(lines).encode()))  # without one in flight
+    write_atomically(journal, "".join(lines).encode())  # without one in flight
     if n:
         yield state
     for after in learn(state, shown.select(range(n, total)), settings):
         n, bare = len(after.records), replace(after, demonstrations=None, records=())
         with journal.open("a") as file:
             file.write(json.dumps([digests[n - 1], after.records[-1]]) + "\n")
-        for name in (
-            *([f"kept_{n:06}"] if n in kept else ()),
-            f"checkpoint_{n % 2}",
-        ):  # a resume is from n on
+        names = [f"kept_{n:06}"] if n in kept else []
+        for name in (*names, f"checkpoint_{n % 2}"):  # a resume is from n on
             save_state(folder / f"{name}.safetensors", bare)
         yield after
 
@@ -107,22 +106,25 @@ def kept_states(folder: str | Path, shown: DemonstrationSet) -> Iterator[State]:
 
 def _found(folder: Path, pattern: str, shown: DemonstrationSet, digests: list[str]) -> Iterator[State]:
     """What the files hold, with its demonstrations and records; a warning for each that cannot be used."""
-    records: list[dict] = []
+    known, records = list[str](), list[dict]()
     for line in (folder / _JOURNAL).read_text().splitlines() if (folder / _JOURNAL).exists() else ():
         try:
             digest, record = json.loads(line)
         except ValueError:  # killed while it was written
             break
-        if digests[len(records) : len(records) + 1] != [digest]:
-            text = "holds checkpoints of other demonstrations; expected another folder"
-            raise InputError(f"{folder}: {text}")
+        known.append(digest)
         records.append(record)
+    if known[: len(digests)] != digests[: len(known)]:
+        raise InputError(f"{folder}: holds checkpoints of other demonstrations; expected another folder")
+    if (n := len(known)) > len(digests):
+        text = f"holds checkpoints of {n} demonstrations, more than the {len(digests)} given"
+        raise InputError(f"{folder}: {text}; expected at least {n}")
     for path in sorted(folder.glob(f"{pattern}.safetensors")):
         try:
-            known = load_state(path, shown.domain)
-            if (n := len(known.weights)) > len(records):
+            state = load_state(path, shown.domain)
+            if (n := len(state.weights)) > len(records):
                 raise InputError(f"{path}: knows {n} demonstrations; expected {n} lines in {_JOURNAL}")
-            yield replace(known, demonstrations=shown.select(range(n)), records=tuple(records[:n]))
+            yield replace(state, demonstrations=shown.select(range(n)), records=tuple(records[:n]))
         except InputError as error:
             warnings.warn(f"{error}; going on from the checkpoint before it", stacklevel=3)
 

@@ -31,6 +31,7 @@ CORRELATIONS = {"pearson": "Pearson", "spearman": "Spearman", "spearman_of_good"
 SHARED = ("AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD as printed", "DMSRD")  # one reward for all
 OURS, RIVALS = ("DMSRD as printed", "DMSRD"), ("AIRL Single", "MSRD")
 TRIALS = (0, 1, 2)
+DEMONSTRATORS = "the demonstrators"  # their row in a table
 VERDICTS = ("holds", "a tie", "does not hold")
 
 # The paper's Table 1: environment return, log-likelihood, KL (as its authors scored them).
@@ -71,29 +72,32 @@ class Benchmark:
 
     domain: Domain
     rows: dict[tuple[int, str, str, int], dict[str, Any]]
-    known: dict[int, dict[str, Any]]  # of each trial: arrival, floor, and the demonstrators' own scores
+    known: dict[int, dict[str, Any]]  # of each trial, in order: arrival, floor, the demonstrators' own scores
 
     def budgets(self, method: str, start: str) -> list[int]:
         return sorted({row[3] for row in self.rows if row[1:3] == (method, start)})
 
     def per_trial(self, method: str, start: str, budget: int) -> list[dict[str, Any]]:
         """The scores of every trial; ``InputError`` where the records do not hold this."""
-        trials = sorted(self.known)
-        found = [self.rows.get((trial, method, start, budget)) for trial in trials]
-        if any(row is None for row in found):
+        rows = [(trial, method, start, budget) for trial in self.known]
+        if not set(rows) <= set(self.rows):
             text = f"{method} from {start} was not scored at {budget:,} steps per demonstration"
             held = ", ".join(f"{b:,}" for b in self.budgets(method, start)) or "nothing of it"
             raise InputError(f"{text}; expected one of the budgets that the records hold: {held}")
-        return [row for row in found if row is not None]
+        return [self.rows[row] for row in rows]
 
     def values(self, method: str, start: str, budget: int, metric: str) -> np.ndarray:
         """One number for each demonstration of each trial: (trials * n,)."""
         return np.concatenate([row[metric] for row in self.per_trial(method, start, budget)]).astype(float)
 
+    def own(self, name: str) -> np.ndarray:
+        """The same of the people themselves: what ``known`` holds of them."""
+        return np.concatenate([one[name] for one in self.known.values()])
+
     @property
     def people(self) -> list[int]:
         """Who each of ``values`` is of."""
-        return [person for trial in sorted(self.known) for person in self.known[trial]["arrival"]]
+        return [person for one in self.known.values() for person in one["arrival"]]
 
     def difference(self, one: Entry, other: Entry, metric: str) -> tuple[float, float, float]:
         """Mean of one method's minus another's and its 95 % interval (``over_people``)."""
@@ -134,7 +138,7 @@ def collect(domain: Domain, trials: Iterator[tuple[int, dict[str, Any]]]) -> Ben
         for name, by_budget in results["scores"].items():
             method, start = name.split(", ")
             rows |= {(trial, method, start, int(budget)): row for budget, row in by_budget.items()}
-    return Benchmark(domain, rows, known)
+    return Benchmark(domain, rows, dict(sorted(known.items())))
 
 
 def load(domain: Domain, settings: BenchmarkLesson, folder: Path = RECORDS) -> Benchmark:
@@ -184,40 +188,47 @@ def first_budget(holds: Callable[[int], str], budgets: Sequence[int]) -> str:
     return "; ".join(f"{text} at {', '.join(at)}" for text, at in where.items() if at)
 
 
+def _table(entries: Sequence[Entry], line: Callable[[Entry], dict], **others: dict) -> pd.DataFrame:
+    """A row for each method and start of which ``line`` says something, then ``others``."""
+    rows = {f"{entry[0]}, {entry[1]}": line(entry) for entry in entries} | others
+    return pd.DataFrame({name: row for name, row in rows.items() if row}).T.fillna("")
+
+
 def summary(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     """Table 1: for each method, start and budget the means over demonstrations and trials with their 95 %
     intervals, and what the demonstrators reach themselves."""
-    table = {}
-    for method, start, budget in entries:
-        rows = found.per_trial(method, start, budget)
-        each = {title: found.values(method, start, budget, m) for m, (title, _) in METRICS.items()}
-        line = {title: in_words(values, found.people) for title, values in each.items()}
-        line["do the task"] = f"{np.mean([able(found.domain, row).mean() for row in rows]):.0%}"
-        line["million steps each"] = f"{np.mean([row['spent'] for row in rows]) / 1e6:.2f}"
+
+    def line(entry: Entry) -> dict[str, str]:
+        rows = found.per_trial(*entry)
         n = len(rows[0]["divergence"])
-        line["search"] = f"{np.mean([row['search_steps'] for row in rows]) / n / 1e6:.2f}"
-        table[f"{method}, {start}"] = line
+        return {
+            **{title: in_words(found.values(*entry, m), found.people) for m, (title, _) in METRICS.items()},
+            "do the task": f"{np.mean([able(found.domain, row).mean() for row in rows]):.0%}",
+            "million steps each": f"{np.mean([row['spent'] for row in rows]) / 1e6:.2f}",
+            "search": f"{np.mean([row['search_steps'] for row in rows]) / n / 1e6:.2f}",
+        }
+
     own = {"return": "own_return", "log-likelihood": "own_log_likelihood", "KL": "floor"}
-    joined = {k: np.concatenate([one[name] for one in found.known.values()]) for k, name in own.items()}
-    table["the demonstrators"] = {k: in_words(values, found.people) for k, values in joined.items()}
-    return pd.DataFrame(table).T.fillna("")
+    themselves = {title: in_words(found.own(name), found.people) for title, name in own.items()}
+    return _table(entries, line, **{DEMONSTRATORS: themselves})
 
 
 def as_published(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     """The same by the authors' scoring, beside the paper's numbers, and which of them ours beat."""
-    table: dict[str, dict[str, Any]] = {}
-    for method, start, budget in entries:
-        line = {t: found.values(method, start, budget, m).mean().round(1) for m, t in PUBLISHED.items()}
-        cells = PAPER[found.domain.name].get("DMSRD as printed" if method == "DMSRD" else method)
-        if cells:
-            theirs = dict(zip(PUBLISHED.values(), cells, strict=True))
-            better = [t for t in theirs if (line[t] < theirs[t] if t == "KL" else line[t] > theirs[t])]
-            line |= {f"paper: {t}": x for t, x in theirs.items()} | {"better": ", ".join(better) or "none"}
-        table[f"{method}, {start}"] = line
+
+    def line(entry: Entry) -> dict[str, Any]:
+        ours = {t: found.values(*entry, m).mean().round(1) for m, t in PUBLISHED.items()}
+        cells = PAPER[found.domain.name].get("DMSRD as printed" if entry[0] == "DMSRD" else entry[0])
+        if not cells:
+            return ours
+        theirs = dict(zip(PUBLISHED.values(), cells, strict=True))
+        better = [t for t in theirs if (ours[t] < theirs[t] if t == "KL" else ours[t] > theirs[t])]
+        beside = {f"paper: {t}": x for t, x in theirs.items()}
+        return {**ours, **beside, "better": ", ".join(better) or "none"}
+
     own = {t: "floor" if t == "KL" else m for m, t in PUBLISHED.items()}
-    joined = {k: np.concatenate([one[name] for one in found.known.values()]) for k, name in own.items()}
-    table["the demonstrators"] = {k: values.mean().round(1) for k, values in joined.items()}
-    return pd.DataFrame(table).T.fillna("")
+    themselves = {title: found.own(name).mean().round(1) for title, name in own.items()}
+    return _table(entries, line, **{DEMONSTRATORS: themselves})
 
 
 def ranking(found: Benchmark, entries: Sequence[Entry], metric: str) -> str:
@@ -233,7 +244,7 @@ def rescued(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     lines = []
     for method, start, budget in entries:
         single = budget in found.budgets("AIRL Single", start)
-        for trial, row in zip(sorted(found.known), found.per_trial(method, start, budget), strict=True):
+        for trial, row in zip(found.known, found.per_trial(method, start, budget), strict=True):
             for i, r in enumerate(row["decisions"]):
                 if r["branch"] == BETTER_MIXTURE:
                     who = (f"{method}, {start}", budget / 1e6, trial, found.known[trial]["arrival"][i])
@@ -272,13 +283,14 @@ def friedman(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
 
 def correlations(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     """What each task reward knows of the true return; one number for each trial."""
-    table = {}
-    for entry in entries:
-        if "pearson" in found.per_trial(*entry)[0]:
-            numbers = {t: found.over_trials(entry, itemgetter(k)) for k, t in CORRELATIONS.items()}
-            line = {t: ", ".join(f"{x:.3f}" for x in values) for t, values in numbers.items()}
-            table[f"{entry[0]}, {entry[1]}"] = line
-    return pd.DataFrame(table).T
+
+    def line(entry: Entry) -> dict[str, str]:
+        if "pearson" not in found.per_trial(*entry)[0]:
+            return {}
+        numbers = {t: found.over_trials(entry, itemgetter(k)) for k, t in CORRELATIONS.items()}
+        return {t: ", ".join(f"{x:.3f}" for x in values) for t, values in numbers.items()}
+
+    return _table(entries, line)
 
 
 def fisher(found: Benchmark, entries: Sequence[Entry], n: int) -> pd.DataFrame:
@@ -288,61 +300,63 @@ def fisher(found: Benchmark, entries: Sequence[Entry], n: int) -> pd.DataFrame:
         for other in (e for e in entries if e[1] == one[1] and e[0] in SHARED[:3]):
             pairs = zip(*(found.over_trials(e, itemgetter("pearson")) for e in (one, other)), strict=True)
             z = [compare_correlations(a, b, n, n)[0] for a, b in pairs]
-            lines[f"{one[0]} - {other[0]}, {one[1]}"] = dict(zip(sorted(found.known), z, strict=True))
+            lines[f"{one[0]} - {other[0]}, {one[1]}"] = dict(zip(found.known, z, strict=True))
     return pd.DataFrame(lines).T.round(1)
 
 
 def teaching(found: Benchmark, entries: Sequence[Entry], controls: dict[int, Any]) -> pd.DataFrame:
     """How many fresh policies do the task after training on each frozen reward, and the mean return of all;
     ``controls``: by trial the same of a reward that was fitted to true returns, or None."""
-    rows = {f"{m}, {start}": found.per_trial(m, start, budget) for m, start, budget in entries}
-    tried = {k: [row.get("worth") for row in some] for k, some in rows.items()}
-    tried["control"] = [controls.get(trial) for trial in sorted(found.known)]
-    table = {}
-    for name, of_trials in tried.items():
-        line = {}
-        for trial, one in zip(sorted(found.known), of_trials, strict=True):
-            if one:
-                count = int(able(found.domain, one).sum())
-                line[f"trial {trial}"] = f"{count} of {len(one['environment_return'])}"
-        if line:
-            returns = np.concatenate([one["environment_return"] for one in of_trials if one])
-            table[name] = {**line, "return": f"{returns.mean():.1f}"}
-    return pd.DataFrame(table).T.fillna("")
+
+    def told(of_trials: Sequence[dict | None]) -> dict[str, str]:
+        tried = {t: one for t, one in zip(found.known, of_trials, strict=True) if one}
+        if not tried:
+            return {}
+        counts = {t: (able(found.domain, one).sum(), len(one["failure_share"])) for t, one in tried.items()}
+        returns = np.concatenate([one["environment_return"] for one in tried.values()])
+        of_each = {f"trial {trial}": f"{count} of {n}" for trial, (count, n) in counts.items()}
+        return {**of_each, "return": f"{returns.mean():.1f}"}
+
+    def line(entry: Entry) -> dict[str, str]:
+        return told([row.get("worth") for row in found.per_trial(*entry)])
+
+    return _table(entries, line, control=told([controls.get(trial) for trial in found.known]))
 
 
 def recognition(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     """How many strategy rewards rank their own person first, by the takes they are asked on; all trials."""
-    table = {}
-    for entry in entries:
+
+    def line(entry: Entry) -> dict[str, str]:
         rows = found.per_trial(*entry)
-        if "recognized_fresh" in rows[0]:
-            counts = {k: sum(r["recognized_fresh"][k] for r in rows) for k in rows[0]["recognized_fresh"]}
-            of = sum(len(r["pure"]) for r in rows)
-            table[f"{entry[0]}, {entry[1]}"] = {k: f"{n} of {of}" for k, n in counts.items()}
-    return pd.DataFrame(table).T
+        of = sum(len(row["pure"]) for row in rows)
+        takes = rows[0].get("recognized_fresh", ())
+        return {take: f"{sum(row['recognized_fresh'][take] for row in rows)} of {of}" for take in takes}
+
+    return _table(entries, line)
 
 
 def cost(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     """What was created, which branches were taken, what it took (a number for each trial, or means), and the
     part of the plan that holds it."""
-    table, part_of = {}, {(m, start): part for part, pairs in BENCHMARK.items() for m, start in pairs}
-    for entry in entries:
+    part_of = {pair: part for part, pairs in BENCHMARK.items() for pair in pairs}
+
+    def line(entry: Entry) -> dict[str, str]:
         rows = found.per_trial(*entry)
         counts = {
             "strategies": [len(row["pure"]) for row in rows],
             "mixtures": [sum(r["branch"] == MIXTURE for r in row["decisions"]) for row in rows],
             "by line 11": [sum(r["branch"] == BETTER_MIXTURE for r in row["decisions"]) for row in rows],
         }
-        line = {k: ", ".join(map(str, v)) if rows[0]["decisions"] else "" for k, v in counts.items()}
-        for title, key, unit in (
-            ("million steps", "steps", 1e6),
-            ("million search steps", "search_steps", 1e6),
-            ("minutes", "seconds", 60),
-        ):
-            line[title] = f"{np.mean([row[key] for row in rows]) / unit:.2f}"
-        table[f"{entry[0]}, {entry[1]}"] = line | {"record": part_of[entry[:2]]}
-    return pd.DataFrame(table).T
+        mean = {k: np.mean([row[k] for row in rows]) for k in ("steps", "search_steps", "seconds")}
+        return {
+            **{k: ", ".join(map(str, v)) if rows[0]["decisions"] else "" for k, v in counts.items()},
+            "million steps": f"{mean['steps'] / 1e6:.2f}",
+            "million search steps": f"{mean['search_steps'] / 1e6:.2f}",
+            "minutes": f"{mean['seconds'] / 60:.2f}",
+            "record": part_of[entry[:2]],
+        }
+
+    return _table(entries, line)
 
 
 def newcomers(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
@@ -370,9 +384,7 @@ def _of_newcomers(
     """Claims 6 and 8, person by person against AIRL Single: number, claim, difference, and is more better;
     steps are all those at the arrival (search, AIRL and the round that follows), in millions."""
     does, mixed, everybody, n_able = [], [], [], 0
-    for trial, row, other in zip(
-        sorted(found.known), found.per_trial(*entry), found.per_trial(*alone), strict=True
-    ):
+    for trial, row, other in zip(found.known, found.per_trial(*entry), found.per_trial(*alone), strict=True):
         can, others = (able(found.domain, one).astype(float) for one in (row, other))
         for i, (who, r) in enumerate(zip(found.known[trial]["arrival"], row["decisions"], strict=True)):
             steps = (sum(r["steps"].values()) - other["spent"]) / 1e6
@@ -426,12 +438,13 @@ def _of_scores(found: Benchmark, entry: Entry, there: dict[str, Entry]) -> Itera
             yield "-", f"better {title}", "cloning", _with_interval(gap), verdict(gap, larger), ""
 
 
-def _over_trials(
+def _by_trials(
     found: Benchmark, one: Entry, other: Entry, value: Callable[[dict[str, Any]], float]
-) -> list[float]:
-    """Differences of a number, trial by trial."""
+) -> tuple[list[float], str]:
+    """Differences of a number, trial by trial, and the verdict: more is better, in all trials or a tie."""
     pairs = zip(*(found.over_trials(e, value) for e in (one, other)), strict=True)
-    return [a - b for a, b in pairs]
+    gaps = [a - b for a, b in pairs]
+    return gaps, verdict((0.0, min(gaps), max(gaps)), True)
 
 
 def _recognized(most: int, row: dict[str, Any]) -> float:
@@ -455,9 +468,8 @@ def _of_rewards(
         claims.append(("5", "BCD: stronger correlation", twin, correlation))
     for number, says, rival, value in claims:
         if rival in there:
-            gaps = _over_trials(found, entry, there[rival], value)
-            numbers = ", ".join(f"{gap:+.3f}" for gap in gaps)
-            yield number, says, rival, numbers, verdict((0.0, min(gaps), max(gaps)), True), ""
+            gaps, told = _by_trials(found, entry, there[rival], value)
+            yield number, says, rival, ", ".join(f"{gap:+.3f}" for gap in gaps), told, ""
 
 
 def standing(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:
@@ -474,8 +486,7 @@ def standing(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFr
             told = {t: verdict(found.difference(entry, rival, m), up) for m, (t, up) in METRICS.items()}
             for title, value in of_rewards.items():
                 if title != "recognised" or rival[0] != "AIRL Batch":  # which has no strategy rewards
-                    gaps = _over_trials(found, entry, rival, value)
-                    told[title] = verdict((0.0, min(gaps), max(gaps)), True)
+                    _, told[title] = _by_trials(found, entry, rival, value)
             table[f"{entry[0]} against {rival[0]}, {entry[1]}"] = {k: words[v] for k, v in told.items()}
     return pd.DataFrame(table).T.fillna("")
 

@@ -19,11 +19,10 @@ TEXTS = {  # page: source
     "index": "notebooks/START.md", "teaching": "notebooks/README.md", "workbook": "README.md",
     "results": "RESULTS.md", "data": "data/README.md", "environment": "environment.md",
 }  # fmt: skip
-EXECUTED, BOOK = ROOT / "papermill_runs" / "quick", ROOT / "build" / "book"
 READING = re.compile(r"\*\*Reading the \w+\.\*\*\s*(.+?)(?=\n\n|$)", re.DOTALL)
 
 
-def make_book(executed: Path = EXECUTED, output: Path = BOOK) -> Path:
+def make_book(executed: Path, output: Path) -> Path:
     """Write the pages into ``output``; returns the first one, ``index.html``.
 
     ``executed``: a folder with a copy of every lesson, as ``make workbook`` leaves it; exercises are shown
@@ -76,10 +75,10 @@ def _markdown(text: str, folder: Path, link: Any) -> str:
 
     class Renderer(IPythonRenderer):
         def block_math(self, body: str) -> str:
-            return convert(body, display="block")
+            return convert(_spaced(body), display="block")
 
         def inline_math(self, body: str) -> str:
-            return convert(body)
+            return convert(_spaced(body))
 
         def block_html(self, html: str) -> str:
             return html  # as it is: what stands between <details> and </details> is text of its own
@@ -91,8 +90,14 @@ def _markdown(text: str, folder: Path, link: Any) -> str:
     return MarkdownWithMath(renderer=renderer).render(text)
 
 
+def _spaced(formula: str) -> str:
+    """MathML sets no space after a function's name."""
+    return re.sub(r"\\log +", r"\\log \\, ", formula)
+
+
 def _notebook(notebook: Any, folder: Path, link: Any) -> str:
     """Cells and outputs; a figure's text for those who do not see it is the one that tells how to read it."""
+    import nbformat
     from nbconvert import HTMLExporter
     from nbconvert.exporters.html import contextfilter
 
@@ -101,6 +106,10 @@ def _notebook(notebook: Any, folder: Path, link: Any) -> str:
         def markdown2html(self, context: Any, source: str) -> str:
             return _markdown(source, folder, link)
 
+    for i, cell in enumerate(notebook.cells):  # what is folded in JupyterLab is folded here
+        if cell.metadata.get("jupyter", {}).get("source_hidden"):
+            text = f"<details><summary>The check</summary>\n\n```python\n{cell.source}\n```\n\n</details>"
+            notebook.cells[i] = nbformat.v4.new_markdown_cell(text)
     following = ""
     for cell in reversed(notebook.cells):
         if found := READING.match(cell.source):

@@ -8,9 +8,8 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from dmsrd_lite.demonstrations import write_atomically
 from dmsrd_lite.domains import InputError
@@ -118,10 +117,6 @@ def _untimed(results: dict) -> dict:
     return {k: v for k, v in results.items() if k.rpartition("_")[2] != "seconds"}
 
 
-def _write(content: bytes, file: IO[bytes]) -> None:
-    file.write(content)
-
-
 def export_gallery(executed: Path, output: Path = ROOT / "papermill_runs" / "gallery") -> list[Path]:
     """The figure of every cell tagged ``gallery-NAME`` in a folder of executed notebooks as ``NAME.png``."""
     import nbformat
@@ -135,7 +130,7 @@ def export_gallery(executed: Path, output: Path = ROOT / "papermill_runs" / "gal
             ]
             for tag, image in zip(tags, map(base64.b64decode, images), strict=False):
                 picture = output / f"{tag.removeprefix('gallery-')}.png"
-                written.append(write_atomically(picture, partial(_write, image)))
+                written.append(write_atomically(picture, image))
     if not written:
         raise InputError(f"{executed.resolve()}: holds no executed notebook with a figure for the gallery")
     return written

@@ -23,6 +23,9 @@ STRATEGY_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
 # All that is no strategy (methods, branches, a single curve): other colours, told apart by marker and line.
 INKS = ("#4B4453", "#B0367A", "#5C7A29", "#A9A1B3", "#6C4AB6", "#2F2F2F")
 INK = INKS[0]
+BRANCHES = {  # of Algorithm 1: marker and colour
+    MIXTURE: ("o", INKS[0]), BETTER_MIXTURE: ("D", INKS[2]), NEW_STRATEGY: ("X", INKS[1]),
+}  # fmt: skip
 INK_MARKERS, INK_LINES = ("o", "s", "D", "^", "v", "P"), ("-", "--", "-.", ":", "-", "--")
 STYLE = dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "white")
 TEN = ("font.size", "axes.titlesize", "axes.labelsize", "xtick.labelsize", "ytick.labelsize")
@@ -64,19 +67,13 @@ def plot_curves(x: np.ndarray, samples: np.ndarray, label: str, ax: Axes | None 
     return seaborn.lineplot(x=np.tile(x, len(samples)), y=samples.ravel(), ax=ax, **style, **band)
 
 
-def plot_phase(
-    domain: Domain,
-    observations: np.ndarray,
-    labels: Sequence[int] | None = None,
-    ax: Axes | None = None,
-    step: int = 5,
-) -> Axes:
-    """Phase portrait: trajectory j (n, T, obs_dim) in the colour of strategy ``labels[j]`` (default j)."""
+def plot_phase(domain: Domain, observations: np.ndarray, ax: Axes | None = None) -> Axes:
+    """Phase portrait: trajectory j (n, T, obs_dim) in the colour of strategy j."""
     ax = ax or plt.gca()
     a, b = drawing_of(domain).phase_axes
     for j, states in enumerate(observations):
-        style = strategy_style(j if labels is None else int(labels[j]))
-        ax.plot(states[::step, a], states[::step, b], linewidth=0.7, color=style["color"], alpha=0.8)
+        style = strategy_style(j)
+        ax.plot(states[::5, a], states[::5, b], linewidth=0.7, color=style["color"], alpha=0.8)
         ax.plot(*states[-1, [a, b]], **style, markersize=6, markeredgecolor="black", linestyle="none")
     ax.set(xlabel=domain.observation_names[a], ylabel=domain.observation_names[b])
     return ax
@@ -180,16 +177,12 @@ def plot_decisions(
     of the branch that was taken; under each column ``who`` it is and the strategies so far."""
     ax = ax or plt.gca()
     x = np.arange(len(records))
-    branches = (
-        (MIXTURE, "decision: mixture", 0),
-        (BETTER_MIXTURE, "mixture, AIRL was worse", 2),
-        (NEW_STRATEGY, "new strategy", 1),
-    )
-    for branch, label, k in branches:
+    labels = "decision: mixture", "mixture, AIRL was worse", "new strategy"
+    for (branch, (_, color)), label in zip(BRANCHES.items(), labels, strict=True):
         taken = [i for i, r in enumerate(records) if r["branch"] == branch]
         for i in taken:
             name = label if i == taken[0] else None
-            ax.axvspan(i - 0.5, i + 0.5, color=INKS[k], alpha=0.15, linewidth=0, zorder=0, label=name)
+            ax.axvspan(i - 0.5, i + 0.5, color=color, alpha=0.15, linewidth=0, zorder=0, label=name)
     for name, key, k in (("best mixture", "kl_mix", 0), ("AIRL's new policy", "kl_new", 1)):
         values = [np.nan if r[key] is None else max(r[key], 0.01) for r in records]
         ax.plot(x + 0.15 * (2 * k - 1), values, "oX"[k], color=INKS[k], label=name, linestyle="none")
@@ -214,11 +207,7 @@ def plot_stream(records: Sequence[dict], floor: np.ndarray, ax: Axes | None = No
     ax = ax or plt.gca()
     x, branches = np.arange(len(records)), np.array([r["branch"] for r in records])
     kl = np.array([r["kl_new"] if r["branch"] == NEW_STRATEGY else r["kl_mix"] for r in records])
-    for branch, marker, color in (
-        (MIXTURE, "o", INKS[0]),
-        (BETTER_MIXTURE, "D", INKS[2]),
-        (NEW_STRATEGY, "X", INKS[1]),
-    ):
+    for branch, (marker, color) in BRANCHES.items():
         some = branches == branch
         name = f"{branch} ({some.sum()})"
         ax.plot(x[some], kl[some], marker, color=color, label=name, linestyle="none", markersize=4)

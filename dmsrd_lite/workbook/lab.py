@@ -18,9 +18,7 @@ CONFIG = {  # nbgrader's panels want a course and show errors without one; Markd
     "page_config.json": {"disabledExtensions": {f"@jupyter/nbgrader:{panel}": True for panel in PANELS}},
     "default_setting_overrides.json": {
         "@jupyterlab/docmanager-extension:plugin": {"defaultViewers": {"markdown": "Markdown Preview"}},
-        "@jupyter-widgets/jupyterlab-manager:plugin": {
-            "saveState": True
-        },  # a slider comes back with the notebook
+        "@jupyter-widgets/jupyterlab-manager:plugin": {"saveState": True},  # sliders come back
         "@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False},
     },
 }

@@ -98,7 +98,7 @@ def slider(draw: Callable[..., Any], **controls: Any) -> None:
     """
     import matplotlib.pyplot as plt
     from IPython.display import display
-    from ipywidgets import HBox, interactive
+    from ipywidgets import HBox, Layout, interactive
 
     parameters = inspect.signature(draw).parameters.items()
     defaults = {name: p.default for name, p in parameters if p.kind is not p.VAR_KEYWORD}
@@ -116,10 +116,12 @@ def slider(draw: Callable[..., Any], **controls: Any) -> None:
         plt.close("all")  # or it would be shown twice
         return figures.Text(answer) if isinstance(answer, str) else answer
 
-    display(Sliders(list(widgets.values())))
-    handle = display(shown(), display_id=True)
     for name, widget in widgets.items():
         widget.description, widget.continuous_update = name, False
+        widget.layout.width, widget.style.description_width = "380px", "initial"
+    display(Sliders(list(widgets.values()), layout=Layout(flex_flow="row wrap")))
+    handle = display(shown(), display_id=True)
+    for widget in widgets.values():
         widget.observe(lambda change: handle.update(shown()), "value")
 
 

@@ -248,7 +248,7 @@ def _record(plan: Plan, run: Run, answer: dict) -> None:
     """Write a run's executed notebook and then its record, each whole or not at all."""
     path, record = plan.folder / f"{run.name}.json", {**asdict(run), "text": "", "plan": plan.name, **answer}
     if text := record.pop("text"):
-        write_atomically(path.with_suffix(".ipynb"), lambda file: file.write(text.encode()))
+        write_atomically(path.with_suffix(".ipynb"), text.encode())
     else:
         path.with_suffix(".ipynb").unlink(missing_ok=True)
-    write_atomically(path, lambda file: file.write((json.dumps(plain(record), indent=1) + "\n").encode()))
+    write_atomically(path, (json.dumps(plain(record), indent=1) + "\n").encode())

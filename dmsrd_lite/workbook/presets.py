@@ -43,18 +43,15 @@ DEMONSTRATORS = {
 }
 
 
-def _for_test_sets(usual: DiaynSettings) -> DiaynSettings:
-    return replace(usual, training=replace(usual.training, n_strategies=10, n_iterations=120, last_rate=1.0))
+TEST_SETS = {
+    name: replace(usual, training=replace(usual.training, n_strategies=10, n_iterations=120, last_rate=1.0))
+    for name, usual in DEMONSTRATORS.items()
+}
 
-
-TEST_SETS = {name: _for_test_sets(usual) for name, usual in DEMONSTRATORS.items()}
-
-# The search for a mixture (Equation 3): candidates, then refinements around the best of them.
-MIXTURE = {PENDULUM: MixtureSettings(64, 32), LANDER: MixtureSettings(64, 32)}
 # The likeliest first. Lander: with 10 rollouts KL shakes by a nat, and eps takes news for noise (lesson 06).
 _OURS = {
-    PENDULUM: replace(MIXTURE[PENDULUM], from_actions=True),
-    LANDER: replace(MIXTURE[LANDER], from_actions=True, final_rollouts=30),
+    PENDULUM: MixtureSettings(from_actions=True),
+    LANDER: MixtureSettings(from_actions=True, final_rollouts=30),
 }
 QUICK_MIXTURE = MixtureSettings(24, 16, n_finalists=5)
 
@@ -143,6 +140,10 @@ METHODS_FROM_NOTHING = {
 }
 
 
+def _by_start(domain: str) -> dict[str, MethodSettings]:
+    return {"clone": METHODS[domain], "nothing": METHODS_FROM_NOTHING[domain]}
+
+
 @dataclass(frozen=True)
 class Start:  # 00
     n_rollouts: int
@@ -169,7 +170,7 @@ class AIRLLesson:  # 02
     @property
     def methods(self) -> dict[str, MethodSettings]:
         """By start."""
-        return {"clone": METHODS[self.domain], "nothing": METHODS_FROM_NOTHING[self.domain]}
+        return _by_start(self.domain)
 
     @property
     def ingredients(self) -> dict[str, AIRLSettings]:
@@ -213,9 +214,8 @@ class MSRDLesson:  # 03
     @property
     def methods(self) -> dict[str, MethodSettings]:
         """By start; with the lesson's alpha."""
-        both = {"clone": METHODS[self.domain], "nothing": METHODS_FROM_NOTHING[self.domain]}
-        alpha = self.msrd.alpha
-        return {start: replace(m, msrd=replace(m.msrd, alpha=alpha)) for start, m in both.items()}
+        usual, alpha = _by_start(self.domain), self.msrd.alpha
+        return {start: replace(m, msrd=replace(m.msrd, alpha=alpha)) for start, m in usual.items()}
 
     @property
     def alphas(self) -> dict[float, MSRDSettings]:
@@ -346,17 +346,22 @@ class BenchmarkLesson:  # 07
     def methods(self, method: str, start: str, budget: int) -> MethodSettings:
         """With so many steps per demonstration, all told; AIRL in DMSRD gets what its rounds will leave."""
         usual: MethodSettings = getattr(self, start)
-        many, n, horizon = 100_000, len(self.users), get_domain(self.domain).horizon
-        a_round = usual.dmsrd.msrd.n_iterations * usual.dmsrd.msrd.episodes
-        own = usual.dmsrd.own_rollouts if method == "DMSRD" else 0
-        rounds = horizon * (a_round * sum(range(2, n + 1)) + own * sum(range(1, n + 1))) // n
+        many, n, loop = 100_000, len(self.users), usual.dmsrd
+        if method.startswith("DMSRD"):
+            a_round = loop.msrd.n_iterations * loop.msrd.episodes
+            own = loop.own_rollouts if method == "DMSRD" else 0
+            episodes = a_round * sum(range(2, n + 1)) + own * sum(range(1, n + 1))
+            rounds = get_domain(self.domain).horizon * episodes // n
+            if budget <= rounds:
+                what = f"{method} from {start} with {budget:,} steps per demonstration"
+                raise InputError(f"{what}: its rounds take them all; expected more than {rounds:,}")
+            loop = replace(loop, airl=replace(loop.airl, n_iterations=many, max_steps=budget - rounds))
         longer: dict[str, Any] = {"n_iterations": many, "max_steps": budget}
-        for_new = replace(usual.dmsrd.airl, n_iterations=many, max_steps=budget - rounds)
         return MethodSettings(
             airl=replace(usual.airl, **longer),
             msrd=replace(usual.msrd, **longer),
             batch=replace(usual.batch, n_iterations=many, max_steps=budget * n),
-            dmsrd=replace(usual.dmsrd, airl=for_new),
+            dmsrd=loop,
         )
 
 
@@ -472,7 +477,7 @@ def _beyond(domain: str, quick: bool) -> BeyondLesson:
         skill={PENDULUM: 0, LANDER: 4}[domain],
         stops={PENDULUM: (0.4,), LANDER: (0.3,)}[domain],
         five=(0, 1, 4, 5, 8) if domain == PENDULUM else (0, 1, 2, 3, 4),
-        pair=(4, 8) if domain == PENDULUM else (0, 2),
+        pair=(8, 9) if domain == PENDULUM else (0, 2),
         training=replace(fresh, n_strategies=3),
         fresh=fresh,
         batch=batch,
@@ -524,8 +529,8 @@ LESSONS: dict[str, Any] = {  # (domain, quick) -> settings
     "03_msrd": lambda domain, quick: MSRDLesson(domain, (0, 1, 2), MSRDSettings(
         n_iterations=9 if quick else 25, discriminator_steps=24, **_small(quick, 8)), _fresh(domain)),
     "04_policy_mixture": lambda domain, quick: MixtureLesson(
-        (4, 8) if domain == PENDULUM else (0, 1), 0.5, QUICK_MIXTURE if quick else MIXTURE[domain],
-        (4, 1, 3) if domain == PENDULUM else (2, 0, 1), MIXTURE[domain], 1000 if quick else 3000),
+        (4, 8) if domain == PENDULUM else (0, 1), 0.5, QUICK_MIXTURE if quick else MixtureSettings(),
+        (4, 1, 3) if domain == PENDULUM else (2, 0, 1), MixtureSettings(), 1000 if quick else 3000),
     "05_between_class_discrimination": lambda domain, quick: DiscriminationLesson(
         _users(quick), 2 if quick else 5,
         MSRDSettings(n_iterations=9 if quick else 20, discriminator_steps=24, **_small(quick, 4)),

@@ -106,8 +106,8 @@ def save_record(
     one_line = r"\[\n\s+([^\[\]{}]*?)\n\s+\]"  # a list a line
     text = re.sub(one_line, lambda m: "[" + re.sub(r"\s*\n\s*", " ", m[1]) + "]", text)
     binary = save({k: np.ascontiguousarray(v) for k, v in tensors.items()})
-    write_atomically(folder / f"{name}.safetensors", lambda f: f.write(binary))
-    return write_atomically(folder / f"{name}.json", lambda f: f.write((text + "\n").encode()))
+    write_atomically(folder / f"{name}.safetensors", binary)
+    return write_atomically(folder / f"{name}.json", (text + "\n").encode())
 
 
 def load_record(name: str, folder: Path = RECORDS) -> tuple[dict, dict[str, np.ndarray]]:

@@ -54,11 +54,8 @@ def write_results(folder: Path | None = None) -> list[Path]:
     table = pd.DataFrame(numbers(), columns=COLUMNS)
     text = table.round(6).to_csv(index=False, lineterminator="\n")
     made = {ROOT / "RESULTS.md": page(table), RECORDS / "results.csv": text, README: parameters()}
-    return [_write(folder / path.name if folder else path, text) for path, text in made.items()]
-
-
-def _write(path: Path, text: str) -> Path:
-    return write_atomically(path, lambda file: file.write(text.encode()))
+    places = {folder / path.name if folder else path: text for path, text in made.items()}
+    return [write_atomically(path, text.encode()) for path, text in places.items()]
 
 
 def numbers() -> Iterator[tuple]:
@@ -221,8 +218,5 @@ def parameters() -> str:
         for name, p in inspect_notebook(str(path)).items():
             cells = f"`{name}`", p["inferred_type_name"], f"`{p['default']}`", p["help"]
             rows.append(f"| [{path.stem}](../notebooks/{path.name}) | {' | '.join(cells)} |")
-    text = README.read_text("utf-8")
-    if BEGIN not in text:
-        text = f"{text.rstrip()}\n\n## Parameters of every lesson\n\n{BEGIN}\n{END}\n"
-    before, rest = text.split(BEGIN)
+    before, rest = README.read_text("utf-8").split(BEGIN)
     return "\n\n".join([before + BEGIN, "\n".join(rows), END + rest.split(END)[1]])

@@ -40,6 +40,8 @@ def show_video(frames: np.ndarray, frames_per_second: float) -> Any:
     import imageio_ffmpeg
     from IPython.display import HTML
 
+    # the browser's controls cover the lowest 50 pixels: white ones
+    frames = np.pad(frames, ((0, 0), (0, 52), (0, 0), (0, 0)), constant_values=255)
     height, width = frames.shape[1] // 2 * 2, frames.shape[2] // 2 * 2
     with tempfile.TemporaryDirectory() as folder:
         path = os.path.join(folder, "video.mp4")
@@ -53,8 +55,7 @@ def show_video(frames: np.ndarray, frames_per_second: float) -> Any:
         with open(path, "rb") as file:
             video = base64.b64encode(file.read()).decode()
     poster = base64.b64encode(picture(frames[0])).decode()
-    style = "max-width:100%; padding-bottom:40px; background:white"  # the controls stand below the picture
     return HTML(
-        f'<video controls loop muted width="{width}" style="{style}" poster="data:image/png;base64,{poster}" '
-        f'src="data:video/mp4;base64,{video}"></video>'
+        f'<video controls loop muted width="{width}" style="max-width:100%" '
+        f'poster="data:image/png;base64,{poster}" src="data:video/mp4;base64,{video}"></video>'
     )

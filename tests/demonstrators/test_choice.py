@@ -54,7 +54,7 @@ def test_only_good_flights_are_shown():
     takes = [rollout(short, actor, 12, [5, 8, take], reset_seeds=starts) for take in (0, 1)]
     bound = float(np.quantile(takes[0].returns, 0.2))
     strict = replace(short, success_return=bound)
-    found, shown = choice.good_flights(strict, actor, DiaynSettings(attempts=4), 3, 5)
+    found, shown = choice.good_flights(strict, actor, DiaynSettings(attempts=4), 5)
     fine = np.all([take.returns >= bound for take in takes], axis=0)
     fails = np.any([(take.observations[:, :, 1:, 0] > 0.4).any(2) for take in takes], axis=0)
     assert (fine & fails).any(), "some must fail although they return enough, or this test says nothing"

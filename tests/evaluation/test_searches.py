@@ -29,7 +29,7 @@ def test_a_row_for_each_newcomer_search_and_budget():
         assert shown.n_demonstrations == 1
         return MixtureFit(tried[2], 0.0, tried, np.array([2.0, 3.0, 1.0]), 4000, 3000)
 
-    rows = list(searches.compare({"made up": find}, THREE, THREE, 2, (1, 3), 0, n_rollouts=2))
+    rows = list(searches.compare({"made up": find}, THREE, THREE, 2, (1, 3), 0))
     assert [row["search"] for row in rows] == ["made up", "made up", "likeliest actions"] * 2
     assert [row["steps"] for row in rows[:3]] == [1000, 3000, 0]
     shown, weights, floor = searches.newcomers(THREE, 2, 0)

@@ -27,29 +27,27 @@ def test_fresh_policies_follow_the_reward_that_they_are_given(domain):
     """Paid to stay upright they last, paid to fall they fall: with the same seed and the same training."""
     settings = replace(SHORT, n_iterations=25)
     good, bad = (worth.reward_worth(Upright(domain, sign), domain, settings, 0) for sign in (1, -1))
-    assert good.curves.shape == (25, 3)
-    assert (good.curves[-5:].mean(0) > bad.curves[-5:].mean(0) + 0.02).all()
-    assert (bad.failure_share == 1).all()
-    row = good.scores()
-    assert worth.able(domain, row).tolist() == worth.solves(domain, good.returns, good.failure_share).tolist()
-    assert row["curves"] == pytest.approx(good.curves, abs=1e-4)
+    assert good["curves"].shape == (25, 3)
+    assert (good["curves"][-5:].mean(0) > bad["curves"][-5:].mean(0) + 0.02).all()
+    assert (bad["failure_share"] == 1).all()
 
 
 def test_the_same_seed_the_same_worth_and_no_true_reward(domain, monkeypatch):
     rewards = Rewards(domain, 1, 0.99, 0)
     one = worth.reward_worth(rewards, domain, SHORT, 3)
     again = worth.reward_worth(MeanRewards([rewards]), domain, SHORT, 3)
-    assert np.array_equal(one.curves, again.curves)
-    assert np.array_equal(one.returns, again.returns)
+    assert np.array_equal(one["curves"], again["curves"])
+    assert np.array_equal(one["environment_return"], again["environment_return"])
 
 
 def test_who_can_do_the_task(domain):
     actor = balancers([0.0, 0.0], sigma=0.05)
     data = rollout(domain, actor, 5, 0)
-    fine, fails = data.returns.mean(1), data.failed.any(-1).mean(1)
-    assert worth.solves(domain, fine, fails).all()
-    assert worth.solves(domain, fine, np.array([0.05, 0.0])).tolist() == [False, True]
-    assert worth.solves(LUNAR_LANDER, np.array([120.0, 90.0]), np.array([0.3, 0.0])).tolist() == [True, False]
+    row = {"environment_return": data.returns.mean(1), "failure_share": data.failed.any(-1).mean(1)}
+    assert worth.able(domain, row).all()
+    assert worth.able(domain, {**row, "failure_share": [0.05, 0.0]}).tolist() == [False, True]
+    flown = {"environment_return": [120.0, 90.0], "failure_share": [0.3, 0.0]}
+    assert worth.able(LUNAR_LANDER, flown).tolist() == [True, False]
 
 
 def test_a_reward_of_another_domain_is_a_sentence(domain):

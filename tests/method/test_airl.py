@@ -92,12 +92,9 @@ def test_from_a_clone_the_policy_is_the_clone_and_from_nothing_untrained(small_s
     assert warm.optimizer.settings.discount == 0.5
     states = small_set.observations[:, 0, :5]
     assert np.array_equal(cold.policies.actor().mean(states), cold.untrained.mean(states))
-    policies, curve = clone_demonstrations(small_set, [0, 101], AIRL_ONE.cloning_steps)
+    policies = clone_demonstrations(small_set, [0, 101], AIRL_ONE.cloning_steps)
     for clone in (warm.policies.actor(), warm.clone):
         assert np.array_equal(clone.mean(states), policies.actor().mean(states))
-    assert curve.shape == (1, 2), "every 50 steps, each of two policies"
-    other, _ = clone_demonstrations(small_set, [0, 101], AIRL_ONE.cloning_steps, streams=(5, 6))
-    assert not np.array_equal(other.actor().mean(states), policies.actor().mean(states))
 
 
 def test_samples_keep_the_density_they_were_drawn_with(small_set):
@@ -165,7 +162,7 @@ def test_the_discriminator_learns_to_tell_a_moved_demonstration(small_set):
 
 def test_the_gradient_penalty_by_finite_differences(small_set):
     """Its value by differences of R, and its gradient in a weight by differences of it (double precision)."""
-    learner = AIRL(small_set, replace(AIRL_ONE, penalty_points="between", penalty_slope=0.2), 0)
+    learner = AIRL(small_set, replace(AIRL_ONE, penalty_slope=0.2), 0)
     learner.rewards.double()
     shown, samples = (part.double() for part in learner.x.split(25, 1)[:2])
     share = np.random.default_rng(7).random((*shown.shape[:2], 1), dtype=np.float32)

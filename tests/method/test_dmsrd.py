@@ -12,7 +12,7 @@ from helpers import assert_decisions_follow
 from tiny import GENEROUS, PENDULUM, ROUGH, TINY, after, assert_same, copied, everything, forbid, same, watch
 
 from dmsrd_lite.domains import LUNAR_LANDER, InputError
-from dmsrd_lite.method import airl, divergence, dmsrd, kl_threshold, rounds
+from dmsrd_lite.method import airl, divergence, dmsrd, rounds
 from dmsrd_lite.method.state import State
 
 WITHOUT_COVERAGE = {name: replace(getattr(ROUGH, name), coverage="none") for name in ("airl", "msrd")}
@@ -160,13 +160,15 @@ def test_the_threshold_is_calibrated_by_the_demonstration_itself(three, domain):
 
 @pytest.mark.parametrize("warm", [True, False])
 def test_on_the_lander_the_clone_calibrates_the_threshold(lander_set, warm, monkeypatch):
-    made, lander = watch(monkeypatch, dmsrd if warm else kl_threshold, "AIRL"), LUNAR_LANDER.on_threads(1)
+    made, lander = watch(monkeypatch, dmsrd, "AIRL"), LUNAR_LANDER.on_threads(1)
     first = replace(lander_set.select([0]), domain=lander)
     kind = {"start": "clone", "coverage": "half"} if warm else {"start": "nothing", "coverage": "none"}
     parts = {k: replace(getattr(ROUGH, k), **kind) for k in ("airl", "msrd")}
     (record,) = after(State(lander, 0), first, replace(TINY, kl_threshold=0.0, **parts)).records
     assert len(made) == 1, "the clone that AIRL starts from is the one that calibrates"
     clone = made[-1]["learner"].clone
+    assert (clone is not None) == warm
+    clone = clone or airl.clone_demonstrations(first, [0, 102, 0, 7, 101], ROUGH.airl.cloning_steps).actor()
     as_many = {"n_rollouts": TINY.mixture.final_rollouts}
     assert record["reference"] == divergence.policy_divergences(clone, first, [0, 102, 0, 7], **as_many)[0]
     assert record["threshold"] == record["reference"] + TINY.kl_margin

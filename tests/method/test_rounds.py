@@ -108,7 +108,7 @@ def test_equation_4_can_be_asked_on_rollouts_of_what_explains_people(own_clones,
     settings = replace(TINY, own_rollouts=2, own_clones=own_clones)
     _, _, steps = rounds.play_round(mixed, False, 1e9, settings, [0])
     states, weights, _ = made[0]["between"]
-    clones = clone_demonstrations(mixed.shown, [0, 7, 2], TINY.airl.cloning_steps)[0].actor()
+    clones = clone_demonstrations(mixed.shown, [0, 7, 2], TINY.airl.cloning_steps).actor()
     flown = rollout(mixed.domain, clones if own_clones else mixed.mixtures(), 2, [0, 7, 0])
     known = {tuple(row) for row in flown.observations[2].reshape(-1, 4)}
     assert {tuple(row) for row in states[2]} <= known

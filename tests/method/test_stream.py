@@ -175,7 +175,8 @@ OTHERS = {
     "source": ({"source": "another"}, "another seed, other settings or other code"),
     "demonstrations": ({"shown": three_users().select([1, 0])}, "other demonstrations"),
     "fields": ({"shown": replace(three_users(), rewards=None)}, "other demonstrations"),
-    "shorter": ({"shown": three_users().select([0])}, "other demonstrations"),
+    "fewer": ({"shown": three_users().select([0])}, "2 demonstrations, more than the 1 given"),
+    "fewer others": ({"shown": three_users().select([1])}, "other demonstrations"),
 }
 
 

@@ -146,11 +146,11 @@ def test_weights_are_found_from_actions_as_recorded(name):
     record, _, domain, seed = prepared(name)
     settings, own_people = record["settings"], people.load_shipped_demonstrators(domain)
     shown = stored.demonstrations(domain.name)
-    clones = clone_demonstrations(shown, [seed, 101], settings["cloning_steps"])[0].actor()
+    clones = clone_demonstrations(shown, [seed, 101], settings["cloning_steps"]).actor()
     m, n = min(settings["n_known"]), settings["n_newcomers"]
     some, nothing = np.random.default_rng([seed, 20, m]).permutation(10)[:m], {}
     own_seed = [seed, 20, m]
-    again = [*searches.compare(nothing, own_people.select(some), clones.select(some), n, (), own_seed, 1)]
+    again = [*searches.compare(nothing, own_people.select(some), clones.select(some), n, (), own_seed)]
     known = [r for r in record["results"]["rows"] if r["known"] == m and r["search"] == "likeliest actions"]
     for key in ("error", "deviation"):
         assert [r[key] for r in again] == pytest.approx([r[key] for r in known], abs=stored.WEIGHT)

@@ -50,6 +50,16 @@ def test_values_follow_trials_and_demonstrations():
     assert table.loc["DMSRD, nothing", "million steps each"] == "0.50"
 
 
+def test_the_order_of_the_records_does_not_count():
+    """Person 1 is in both trials; a person's own floor must not be counted as another's."""
+    trials = [(0, trial((-3.0, -2.0))), (1, trial((-4.0, -2.0), arrival=(1, 2)))]
+    trials[1][1]["known"]["floor"] = [2.0, 7.0]
+    one, other = (benchmark.collect(INVERTED_PENDULUM, iter(some)) for some in (trials, trials[::-1]))
+    pair = [("DMSRD", "nothing", 500_000)]
+    assert benchmark.summary(one, pair).loc["the demonstrators", "KL"].startswith("3.33 [")
+    assert benchmark.summary(one, pair).equals(benchmark.summary(other, pair))
+
+
 def test_what_frozen_rewards_teach():
     held, fell = {"environment_return": [-9.0, -9.0], "failure_share": [0, 0]}, -1e6
     worth = [held, {"environment_return": [-9.0, fell], "failure_share": [0, 1]}]
@@ -197,12 +207,26 @@ def test_a_verdict_over_the_budget():
     assert benchmark.first_budget(told.get, [100_000]) == "holds"
 
 
+@pytest.mark.parametrize("domain", ["inverted_pendulum", "lunar_lander"])
+def test_every_method_can_be_had_at_its_budgets_or_says_why_not(domain):
+    settings = presets.choose("07_benchmark", domain, "full")
+    for method, start in [pair for pairs in presets.BENCHMARK.values() for pair in pairs]:
+        others = () if method.startswith("DMSRD") else settings.budgets
+        for budget in {*settings.trained_for(method, start), *others}:
+            chosen = settings.methods(method, start, budget)
+            assert chosen.airl.max_steps == chosen.msrd.max_steps == budget
+    with pytest.raises(InputError, match=r"^DMSRD from nothing with 100,000 steps .* expected more than 1"):
+        LESSON.methods("DMSRD", "nothing", 100_000)
+
+
 def test_everybody_from_nothing_gets_the_same_steps():
     """DMSRD's AIRL and its rounds together spend what AIRL and MSRD spend, a batch that of ten."""
     for method in ("AIRL Single", "MSRD", "AIRL Batch", "DMSRD as printed", "DMSRD"):
         chosen = LESSON.methods(method, "nothing", 500_000)
         assert chosen.airl.max_steps == chosen.msrd.max_steps == 500_000
         assert chosen.batch.max_steps == 5_000_000
+        if not method.startswith("DMSRD"):
+            continue
         loop, strategies = chosen.dmsrd, range(2, 11)
         a_round = loop.msrd.n_iterations * loop.msrd.episodes * 1000
         spent = [a_round * m for m in strategies]

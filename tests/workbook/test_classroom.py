@@ -111,7 +111,11 @@ def test_bad_input_is_one_sentence(course, tmp_path, capsys):
             True,
         ),
         (lambda notebook: notebook.cells.clear(), "no task of the exercise", False),
-        (lambda notebook: notebook.update(exercises.student_copy("02_airl")), "no task of the exercise", False),
+        (
+            lambda notebook: notebook.update(exercises.student_copy("02_airl")),
+            "no task of the exercise",
+            False,
+        ),
         (lambda notebook: None, "", True),
     ],
 )

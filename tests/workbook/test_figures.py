@@ -50,8 +50,8 @@ def test_curves_are_means_with_a_band(ax):
 
 def test_trajectories_in_the_colours_of_their_strategies(small_set, ax):
     shown, domain = small_set.observations[:, 0], small_set.domain
-    figures.plot_phase(domain, shown, labels=[4, 1], ax=ax)
-    assert [line.get_color() for line in ax.lines[::2]] == [figures.STRATEGY_COLORS[k] for k in (4, 1)]
+    figures.plot_phase(domain, shown, ax)
+    assert [line.get_color() for line in ax.lines[::2]] == [figures.STRATEGY_COLORS[k] for k in (0, 1)]
     assert np.array_equal(ax.lines[2].get_xydata(), shown[1, ::5][:, list(domain.drawing.phase_axes)])
 
 
