@@ -91,14 +91,20 @@ class DemonstrationSet:
 _ARRAYS = ("observations", "actions", "rewards", "strategy_labels", "reset_seeds", "log_likelihoods")
 
 
+AT_ONCE = 100_000  # states of a policy whose density is asked: memory stays bounded
+
+
 def demonstrations_from(data: "Rollouts", actor: "Policies") -> DemonstrationSet:
     """Rollouts of M policies as M demonstrations, with the policies' own log-likelihood of them."""
     m, k, t = data.rewards.shape
-    executed = data.executed_actions
-    log_pi = actor.log_density(
-        data.observations[:, :, :-1].reshape(m, k * t, -1), executed.reshape(m, k * t, -1)
-    )
-    own = log_pi.reshape(m, k, t).astype(np.float64).sum(-1)
+    executed, some = data.executed_actions, max(1, AT_ONCE // (m * t))  # episodes at a time
+    own = np.zeros((m, k))
+    for i in range(0, k, some):
+        states, acted = data.observations[:, i : i + some, :-1], executed[:, i : i + some]
+        log_pi = actor.log_density(
+            states.reshape(m, -1, states.shape[-1]), acted.reshape(m, -1, acted.shape[-1])
+        )
+        own[:, i : i + some] = log_pi.reshape(m, -1, t).astype(np.float64).sum(-1)
     return DemonstrationSet(
         data.domain, data.observations, executed, data.rewards, np.arange(m), data.reset_seeds, own
     )

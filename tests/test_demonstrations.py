@@ -80,7 +80,7 @@ def test_pooled_selected_and_joined(small_set):
     assert (both.n_demonstrations, both.metadata) == (3, {"seed": 7})
 
 
-def test_rollouts_as_demonstrations(domain):
+def test_rollouts_as_demonstrations(domain, monkeypatch):
     actor = GaussianPolicies(domain, 2, 0, sigma=2.0).actor()
     data = rollout(domain, actor, 2, 0, horizon=20)
     shown = demonstrations.demonstrations_from(data, actor)
@@ -89,6 +89,9 @@ def test_rollouts_as_demonstrations(domain):
     )
     one = actor.select([1]).log_density(shown.observations[1, 0, :-1][None], shown.actions[1, 0][None])
     assert shown.log_likelihoods[1, 0] == pytest.approx(one.sum(), rel=1e-5)
+    monkeypatch.setattr(demonstrations, "AT_ONCE", 40)  # one episode at a time
+    few = demonstrations.demonstrations_from(data, actor)
+    assert few.log_likelihoods == pytest.approx(shown.log_likelihoods, rel=1e-5)
 
 
 def change(name, value):

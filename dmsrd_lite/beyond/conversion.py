@@ -65,7 +65,9 @@ def convert(
     if "rewards" not in kept:
         notes.append("there are no rewards: returns are unknown, and nothing that learns needs them")
     if each == 1:
-        notes.append("one trajectory per person: how far it is from itself is unknown (lesson 06, eps)")
+        notes.append(
+            "one trajectory per person: no floor, eps is a guess (lesson 06); --each K joins K of them"
+        )
     found = DemonstrationSet(domain, **kept, metadata={"source": path.name})
     if faults := found.faults():
         raise InputError(f"{path}: {faults[0]}")
@@ -79,6 +81,9 @@ def _stack(parts: Sequence[np.ndarray], each: int, n: int) -> np.ndarray:
 
 
 def _domain_of(path: Path, episode: Episode) -> Domain:
+    if episode.actions is not None and episode.actions.ndim != 2:
+        shape = f"has actions of shape {episode.actions.shape} in an episode"
+        raise InputError(f"{path}: {shape}; expected (steps, dimension), of continuous actions")
     acted = 0 if episode.actions is None else episode.actions.shape[-1]
     found = [d for d in DOMAINS.values() if d.obs_dim == episode.observations.shape[-1]]
     fits = [d for d in found if episode.actions is None or d.action_dim == acted]
@@ -136,7 +141,8 @@ def _episodes(path: Path) -> tuple[list[Episode], int]:
     """What the file or folder holds, and how many in a row are one person's (0: it does not say)."""
     kinds = "an .npz file, a Minari dataset, or trajectories saved by imitation"
     if not path.exists():
-        raise InputError(f"{path}: there is no such file or folder; expected {kinds}")
+        where = f"{kinds} (a Minari dataset's folder: ~/.minari/datasets/ID)"
+        raise InputError(f"{path}: there is no such file or folder; expected {where}")
     if path.suffix == ".npz":
         return _from_arrays(path)
     if (path / "state.json").is_file():
@@ -169,6 +175,9 @@ def _from_arrays(path: Path) -> tuple[list[Episode], int]:
         if name in arrays and (arrays[name].shape[: len(lead)] != lead or arrays[name].ndim != n_axes):
             wanted = ", ".join([*map(str, lead), "steps", "dimension"][:n_axes])
             raise InputError(f"{path}: {name}: has shape {arrays[name].shape}; expected ({wanted})")
+    if other := {"dones", "terminals", "truncations", "timeouts"} & arrays.keys():
+        what = f"{', '.join(sorted(other))}: is not read"
+        raise InputError(f"{path}: {what}; expected terminations, or nothing where no episode ended early")
     n, names = int(np.prod(lead)), ("observations", "actions", "rewards", "reset_seeds")
     flat = [arrays[k].reshape(n, *arrays[k].shape[len(lead) :]) if k in arrays else [None] * n for k in names]
     ended, t = arrays.get("terminations", np.zeros(lead)), arrays.get("actions", states).shape[-2]

@@ -106,6 +106,7 @@ def test_notes(arrays, tmp_path):
         ({"terminations": np.zeros(3)}, {}, "terminations: has shape (3,); expected (4,) or (4, 12)"),
         ({"terminations": np.zeros((3, T))}, {}, "terminations: has shape (3, 12); expected (4,) or (4, 12)"),
         ({"terminations": np.zeros((N, 9))}, {}, "terminations: has shape (4, 9); expected (4,) or (4, 12)"),
+        ({"dones": np.zeros((N, T))}, {}, "dones: is not read; expected terminations, or nothing"),
         ({"rewards": np.full((N, T), "x")}, {}, "episode 0: rewards: has type <U1; expected numbers"),
         ({"rewards": np.zeros((N, 11))}, {"steps": 10}, "0: has rewards of shape (11,); expected (12,)"),
         ({"rewards": np.full((N, T), np.nan)}, {}, "0: rewards: holds NaN or infinity, first at step 0; exp"),
