@@ -229,9 +229,6 @@ def test_the_book_opens_without_a_network(browser, server, tmp_path):
     page.goto((first.parent / "00_start_here.html").as_uri())
     assert all(page.locator("main img").evaluate_all("all => all.map(one => one.alt.length > 20)"))
     assert page.locator("main img").count()
-    assert page.locator("main video").count()
-    page.locator("main video").first.scroll_into_view_if_needed()
-    page.screenshot(path=PICTURES / "book_video.png")
     page.goto((first.parent / "exercise_02_airl.html").as_uri())
     assert not page.locator("details pre").first.is_visible()
     asked = []
