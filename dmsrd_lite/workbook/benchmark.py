@@ -338,7 +338,7 @@ def recognition(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
 def cost(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     """What was created, which branches were taken, what it took (a number for each trial, or means), and the
     part of the plan that holds it."""
-    part_of = {pair: part for part, pairs in BENCHMARK.items() for pair in pairs}
+    part_of = {pair: part for part, pairs in reversed(BENCHMARK.items()) for pair in pairs}
 
     def line(entry: Entry) -> dict[str, str]:
         rows = found.per_trial(*entry)
@@ -470,6 +470,21 @@ def _of_rewards(
         if rival in there:
             gaps, told = _by_trials(found, entry, there[rival], value)
             yield number, says, rival, ", ".join(f"{gap:+.3f}" for gap in gaps), told, ""
+
+
+def equal_steps(found: Benchmark, share: int, main: int) -> pd.DataFrame:
+    """The control of what DMSRD's rounds cost: AIRL Single with ``share`` steps for each person, as DMSRD's
+    AIRL has, beside both with ``main`` steps; then DMSRD's minus the control's, and the verdict."""
+    control, ours = ("AIRL Single", "nothing", share), ("DMSRD", "nothing", main)
+    rows = {
+        f"{m}, {b / 1e6:.2f} M": (m, s, b) for m, s, b in (control, ours, ("AIRL Single", "nothing", main))
+    }
+    table = {}
+    for metric, (title, larger) in METRICS.items():
+        gap = found.difference(ours, control, metric)
+        means = {name: f"{found.values(*entry, metric).mean():.2f}" for name, entry in rows.items()}
+        table[title] = means | {"difference": _with_interval(gap), "better": verdict(gap, larger)}
+    return pd.DataFrame(table).T
 
 
 def standing(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:

@@ -314,6 +314,7 @@ BENCHMARK = {  # what each part trains: method, start
     "rivals": [(method, "nothing") for method in ("AIRL Single", "AIRL Batch", "MSRD")],
     "ours": [("DMSRD without BCD", "nothing"), ("DMSRD", "nothing")],
     "printed": [("DMSRD as printed", "nothing")],
+    "control": [("AIRL Single", "nothing")],  # with the steps that DMSRD leaves to its AIRL
 }
 
 
@@ -335,8 +336,15 @@ class BenchmarkLesson:  # 07
         """Of policies on a frozen task reward."""
         return _fresh(self.domain)
 
-    def trained_for(self, method: str, start: str) -> tuple[int, ...]:
+    @property
+    def share(self) -> int:
+        """Of the main budget, what DMSRD's rounds leave to its AIRL, from nothing."""
+        return self.methods("DMSRD", "nothing", self.main).dmsrd.airl.max_steps
+
+    def trained_for(self, method: str, start: str, part: str = "") -> tuple[int, ...]:
         """The budgets that ask for a training of their own."""
+        if part == "control":
+            return (self.share,)
         if start == "clone":
             return (self.from_clone,)
         if method.startswith("DMSRD"):

@@ -114,7 +114,7 @@ def test_records_are_read_whole_or_not_at_all(tmp_path):
     assert json.loads(files[-1].read_text())["parameters"]["seed"] == 2
     files[-1].unlink()
     with pytest.raises(
-        InputError, match=r"printed_seed2 is missing; expected all trials: run papermill_runs/"
+        InputError, match=r"control_seed2 is missing; expected all trials: run papermill_runs/"
     ):
         benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
 
@@ -205,6 +205,21 @@ def test_a_verdict_over_the_budget():
     )
     assert benchmark.first_budget(told.get, [1_000_000]) == "does not hold"
     assert benchmark.first_budget(told.get, [100_000]) == "holds"
+
+
+def test_the_control_has_the_steps_of_dmsrds_airl():
+    """20 episodes of 1000 steps a round and strategy, and 5 of every explanation, are paid from 500,000."""
+    assert LESSON.share == 500_000 - (20 * 54 + 5 * 55) * 100
+    assert LESSON.trained_for("AIRL Single", "nothing", "control") == (LESSON.share,)
+    trials = [(k, trial((-3.0 - k, -2.0))) for k in (0, 1)]
+    for k in (0, 1):
+        scores = {str(LESSON.share): row([-9.0, -7.0]), "500000": row([-2.0, -1.0])}
+        known = trials[k][1]["known"]
+        trials.append((k, {"known": known, "scores": {"AIRL Single, nothing": scores}}))
+    table = benchmark.equal_steps(benchmark.collect(INVERTED_PENDULUM, iter(trials)), LESSON.share, 500_000)
+    assert table.loc["return"].tolist()[:3] == ["-8.00", "-2.75", "-1.50"]
+    assert table.loc["return", "difference"].startswith("+5.25 [")
+    assert table["better"].tolist() == ["holds", "a tie", "a tie"]
 
 
 @pytest.mark.parametrize("domain", ["inverted_pendulum", "lunar_lander"])

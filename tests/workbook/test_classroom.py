@@ -1,8 +1,12 @@
 """A class, from clone to grades: who handed in what, and what it earned."""
 
+import os
 import re
 import shutil
+import subprocess
+import sys
 from collections import Counter
+from pathlib import Path
 
 import nbformat
 import pandas as pd
@@ -155,6 +159,17 @@ def test_notes_of_another_lesson_stay(course, tmp_path):
     table = pd.read_csv(classroom.grade(own, tmp_path / "second"), keep_default_na=False)
     assert list(table.lesson) == [LESSON, "07_benchmark"]
     assert all(table.note.str.contains("does not open"))
+
+
+@pytest.mark.verify
+def test_nbgraders_own_command_makes_the_same_copies(tmp_path):
+    folder = shutil.copytree(classroom.SETTINGS.parent, tmp_path / "exercises")
+    before = (folder / LESSON / f"{LESSON}.ipynb").read_bytes()
+    (folder / LESSON / f"{LESSON}.ipynb").unlink()
+    command = [sys.executable, "-m", "nbgrader", "generate_assignment", LESSON, "--force"]
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    subprocess.run(command, cwd=folder, check=True, env=environment)
+    assert (folder / LESSON / f"{LESSON}.ipynb").read_bytes() == before
 
 
 @pytest.mark.verify
