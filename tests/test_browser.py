@@ -218,15 +218,18 @@ def test_a_link_leads_to_the_next_lesson_and_a_wrong_parameter_to_one_sentence(b
 
 
 def test_the_book_opens_without_a_network(browser, server, tmp_path):
-    executed, name = Path(shutil.copytree(NOTEBOOKS, tmp_path / "executed")), "00_start_here.ipynb"
-    shutil.copyfile(NOTEBOOKS / name, server[0] / name)  # another test typed something wrong into it
-    opened = Opened(browser, server, "00_start_here")
+    executed, name = Path(shutil.copytree(NOTEBOOKS, tmp_path / "executed")), "01_demonstrations"
+    opened = Opened(browser, server, name)
     opened.run_all()
     opened.page.close()
-    shutil.copyfile(opened.path, executed / name)
+    shutil.copyfile(opened.path, executed / opened.path.name)
     first = book.make_book(executed, tmp_path / "book")
     page = browser.new_page(viewport={"width": 1280, "height": 900})
-    page.goto((first.parent / "00_start_here.html").as_uri())
+    page.goto((first.parent / f"{name}.html").as_uri())
+    film = page.locator("main video").first
+    film.scroll_into_view_if_needed()
+    assert film.evaluate("film => film.play().then(() => film.videoWidth)") > 100
+    page.screenshot(path=PICTURES / "film.png")
     assert all(page.locator("main img").evaluate_all("all => all.map(one => one.alt.length > 20)"))
     assert page.locator("main img").count()
     page.goto((first.parent / "exercise_02_airl.html").as_uri())

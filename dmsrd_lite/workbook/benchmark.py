@@ -167,10 +167,14 @@ def load(domain: Domain, settings: BenchmarkLesson, folder: Path = RECORDS) -> B
 
 
 def entries(found: Benchmark, settings: BenchmarkLesson) -> list[Entry]:
-    """Who is compared in the tables: every method from each start, at the main budget of that start."""
+    """Who is compared in the tables: every method from each start, at the main budget of that start.
+
+    All rows there are if none has it, as where the control alone was trained.
+    """
     main = {"clone": settings.from_clone, "nothing": settings.main}
     pairs = [(method, start, budget) for start, budget in main.items() for method in METHODS]
-    return [(m, s, budget) for m, s, budget in pairs if budget in found.budgets(m, s)]
+    at_main = [(m, s, budget) for m, s, budget in pairs if budget in found.budgets(m, s)]
+    return at_main or [(method, start, budget) for _, method, start, budget in found.rows]
 
 
 def verdict(difference: tuple[float, float, float], larger_is_better: bool) -> str:

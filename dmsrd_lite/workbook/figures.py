@@ -132,7 +132,7 @@ def plot_heatmap(
 ) -> Axes:
     """A table (n, m) as a heatmap with its numbers; ``names``: xlabel, ylabel, xticklabels, yticklabels."""
     ticks = {name: names.pop(name) for name in ("xticklabels", "yticklabels") if name in names}
-    small, bar = {"fontsize": 7}, {"label": label}
+    small, bar = {"fontsize": 8}, {"label": label}
     ax = seaborn.heatmap(
         table, ax=ax, cmap="cividis", annot=True, fmt=fmt, annot_kws=small, cbar_kws=bar, **ticks
     )

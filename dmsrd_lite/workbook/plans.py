@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from glob import glob
 from hashlib import sha256
 from itertools import product
@@ -223,7 +224,8 @@ def _has(run: Run, pair: str) -> bool:
 
 def _perform(plan: Plan, todo: list[Run], workers: int, scheduler: str) -> None:
     """Dask keeps the queue, and begins a run anew when its worker dies; an answer is recorded as it comes."""
-    from distributed import CancelledError, as_completed
+    from distributed import CancelledError, wait
+    from distributed.comm import CommClosedError
     from filelock import FileLock, Timeout
     from tqdm import tqdm
 
@@ -231,16 +233,26 @@ def _perform(plan: Plan, todo: list[Run], workers: int, scheduler: str) -> None:
     lock = FileLock(plan.folder / ".lock", timeout=0)  # it ends with the process, however that ends
     n_workers = min(workers or max(1, (os.cpu_count() or 2) // 2), len(todo))  # a lesson uses two cores
     try:
-        with lock, _client(n_workers, scheduler) as client:
-            sent = (client.submit(perform, r, plan.cell_seconds, os.getcwd(), pure=False) for r in todo)
-            waiting = dict(zip(sent, todo, strict=True))
-            for future in tqdm(as_completed(list(waiting)), total=len(todo), unit="run", smoothing=0):
-                answer = {"error": in_one_line(future.exception())} if future.exception() else future.result()
-                _record(plan, waiting.pop(future), answer)
-                future.release()  # or Dask would run it again when the worker that holds the answer dies
+        bar = partial(tqdm, total=len(todo), unit="run", smoothing=0)
+        with lock, _client(n_workers, scheduler) as client, bar() as progress:
+            left, running = todo[::-1], dict[Any, Run]()
+            while left or running:
+                # No run waits at a worker: Dask would count a neighbour's killed workers against it, too
+                while left and len(running) < max(1, sum(client.ncores().values())):
+                    future = client.submit(perform, left[-1], plan.cell_seconds, os.getcwd(), pure=False)
+                    running[future] = left.pop()
+                with suppress(TimeoutError):  # then look whether workers have come
+                    wait(list(running), timeout=5, return_when="FIRST_COMPLETED")
+                for future in [future for future in running if future.done()]:
+                    error = future.exception()
+                    _record(
+                        plan, running.pop(future), {"error": in_one_line(error)} if error else future.result()
+                    )
+                    future.release()  # or Dask would run it again when the worker that holds the answer dies
+                    progress.update()
     except Timeout:
         raise InputError(f"{plan.folder}: another run of this plan goes on; expected one at a time") from None
-    except CancelledError:
+    except (CancelledError, CommClosedError):
         raise InputError("the Dask scheduler is gone; run the same command again for what is left") from None
 
 

@@ -220,6 +220,9 @@ def test_the_control_has_the_steps_of_dmsrds_airl():
     assert table.loc["return"].tolist()[:3] == ["-8.00", "-2.75", "-1.50"]
     assert table.loc["return", "difference"].startswith("+5.25 [")
     assert table["better"].tolist() == ["holds", "a tie", "a tie"]
+    alone = benchmark.collect(INVERTED_PENDULUM, iter([trials[-1]]))
+    del alone.rows[1, "AIRL Single", "nothing", 500_000]
+    assert benchmark.entries(alone, LESSON) == [("AIRL Single", "nothing", LESSON.share)]
 
 
 @pytest.mark.parametrize("domain", ["inverted_pendulum", "lunar_lander"])

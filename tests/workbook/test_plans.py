@@ -9,7 +9,7 @@ import socket
 import sys
 import textwrap
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, STDOUT, Popen, check_output
@@ -101,16 +101,27 @@ def here(tmp_path, monkeypatch):
 def hand_started_cluster(n_workers):
     """A scheduler and workers as somebody starts them in a terminal; yields the scheduler and its address."""
     port = str(socket.create_server(("127.0.0.1", 0)).getsockname()[1])
-    address, quiet = f"tcp://127.0.0.1:{port}", {"stdout": DEVNULL, "stderr": DEVNULL}
-    scheduler = ["scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard", "--no-show"]
-    workers = [["worker", address, "--nthreads", "1", "--no-dashboard", "--memory-limit", "0"]] * n_workers
-    started = [Popen([sys.executable, "-m", "dask", *c], **quiet) for c in (scheduler, *workers)]
+    address = f"tcp://127.0.0.1:{port}"
+    with (
+        dask("scheduler", "--host", "127.0.0.1", "--port", port, "--no-show") as scheduler,
+        ExitStack() as workers,
+    ):
+        for _ in range(n_workers):
+            workers.enter_context(dask("worker", address, *ONE_THREAD))
+        yield scheduler, address
+
+
+ONE_THREAD = ("--nthreads", "1", "--memory-limit", "0")
+
+
+@contextmanager
+def dask(*words):
+    process = Popen([sys.executable, "-m", "dask", *words, "--no-dashboard"], stdout=DEVNULL, stderr=DEVNULL)
     try:
-        yield started[0], address
+        yield process
     finally:
-        for process in reversed(started):
-            process.terminate()
-            process.wait(30)
+        process.terminate()
+        process.wait(30)
 
 
 def test_a_small_plan_with_a_failing_run_and_a_killed_worker(capsys):
@@ -295,6 +306,18 @@ lesson.hand_over(environment_steps=60, total=scale * data.returns)"""
 
 
 @pytest.mark.verify
+def test_workers_may_come_after_the_plan():
+    both = "while len(open('begun').read().split()) < 2:\n    time.sleep(0.1)"
+    write_plan(TWO_SEEDS, both)
+    with hand_started_cluster(0) as (_, address):
+        driver = start("--scheduler", address)
+        time.sleep(3)
+        with dask("worker", address, *ONE_THREAD), dask("worker", address, *ONE_THREAD):
+            printed, _ = driver.communicate(timeout=90)
+    assert driver.returncode == 0, printed
+
+
+@pytest.mark.verify
 def test_a_scheduler_that_dies_or_is_not_there_is_one_sentence(capsys):
     write_plan("[grid]\nseed = [0, 1, 2]", "time.sleep(3)")
     with hand_started_cluster(1) as (scheduler, address):
@@ -302,7 +325,7 @@ def test_a_scheduler_that_dies_or_is_not_there_is_one_sentence(capsys):
         wait_for(records)
         scheduler.kill()
         printed, _ = driver.communicate(timeout=90)
-    assert (driver.returncode, "Traceback" in printed) == (2, False)
+    assert (driver.returncode, "Traceback" in printed) == (2, False), printed
     assert "the Dask scheduler is gone; run the same command again for what is left" in printed
     assert records()[0]["error"] == ""
     assert run("--scheduler", address) == 2
