@@ -10,6 +10,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+import torch
 
 from dmsrd_lite.workbook import classroom
 from dmsrd_lite.workbook.exercises import check
@@ -133,6 +134,9 @@ def test_student_copies_are_up_to_date_and_hold_no_solution(tmp_path):
         ("mixture", "new strategy", "mixture"),
         (True, 1.0, None),
         ((1.0, [2.0]), (1.0, [3.0]), "expected"),
+        ([torch.tensor(1.0, requires_grad=True), torch.tensor(2.0)], [1.0, 2.0], None),
+        ([None, 1.0], [1.0, 2.0], "None"),
+        ([[1.0], [1.0, 2.0]], [1.0, 2.0], "a list that is no array of numbers"),
     ],
 )
 def test_a_check_says_what_is_wrong(found, right, words):

@@ -53,6 +53,8 @@ def same(one: Any, other: Any, tolerance: float = 1e-6) -> bool:
 
 
 def _plain(x: Any) -> Any:
+    if isinstance(x, (list, tuple)):  # of tensors, maybe
+        return [_plain(part) for part in x]
     return x.detach().numpy() if isinstance(x, torch.Tensor) else x
 
 
@@ -61,11 +63,17 @@ def _shape(x: Any) -> str:
         return f"a tuple of {len(x)}"
     if x is None or isinstance(x, (str, bool)):
         return "nothing (is a return missing?)" if x is None else f"a {type(x).__name__}"
-    shape = np.shape(_plain(x))
+    try:
+        shape = np.asarray(_plain(x), dtype=float).shape
+    except (TypeError, ValueError):
+        return f"a {type(x).__name__} that is no array of numbers"
     return f"an array of shape {shape}" if shape else "a number"
 
 
 def _shown(x: Any, digits: int) -> str:
     if isinstance(x, (str, tuple)) or x is None:
         return str(x)
-    return np.array2string(np.round(np.asarray(_plain(x)), digits), precision=digits)
+    try:
+        return np.array2string(np.round(np.asarray(_plain(x)), digits), precision=digits)
+    except TypeError:  # nothing where a number belongs
+        return str(x)
