@@ -133,6 +133,7 @@ def test_student_copies_are_up_to_date_and_hold_no_solution(tmp_path):
         ([2.0, 1.0], [1.0, 2.0], "swapped"),
         ("mixture", "new strategy", "mixture"),
         (True, 1.0, None),
+        ("1.0", 1.0, "a str; expected a number"),
         ((1.0, [2.0]), (1.0, [3.0]), "expected"),
         ([torch.tensor(1.0, requires_grad=True), torch.tensor(2.0)], [1.0, 2.0], None),
         ([None, 1.0], [1.0, 2.0], "None"),

@@ -43,7 +43,7 @@ def same(one: Any, other: Any, tolerance: float = 1e-6) -> bool:
             and len(one) == len(other)
             and all(same(a, b, tolerance) for a, b in zip(one, other, strict=True))
         )
-    if one is None or other is None or isinstance(other, (str, bool)):
+    if one is None or other is None or isinstance(one, str) or isinstance(other, (str, bool)):
         return type(one) is type(other) and one == other
     try:
         a, b = (np.asarray(_plain(x), dtype=float) for x in (one, other))
