@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch
 
 
 class Wrong(AssertionError):
@@ -45,17 +44,24 @@ def same(one: Any, other: Any, tolerance: float = 1e-6) -> bool:
         )
     if one is None or other is None or isinstance(one, str) or isinstance(other, (str, bool)):
         return type(one) is type(other) and one == other
-    try:
-        a, b = (np.asarray(_plain(x), dtype=float) for x in (one, other))
-    except (TypeError, ValueError):
+    a, b = _numbers(one), _numbers(other)
+    if a is None or b is None or a.shape != b.shape:
         return False
-    return a.shape == b.shape and np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True)
+    return np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True)
 
 
 def _plain(x: Any) -> Any:
     if isinstance(x, (list, tuple)):  # of tensors, maybe
         return [_plain(part) for part in x]
-    return x.detach().numpy() if isinstance(x, torch.Tensor) else x
+    return x.detach().numpy() if hasattr(x, "detach") else x  # PyTorch is slow to import, and not needed here
+
+
+def _numbers(x: Any) -> np.ndarray | None:
+    """As an array; None if that is no array of numbers."""
+    try:
+        return np.asarray(_plain(x), dtype=float)
+    except (TypeError, ValueError):
+        return None
 
 
 def _shape(x: Any) -> str:
@@ -63,11 +69,9 @@ def _shape(x: Any) -> str:
         return f"a tuple of {len(x)}"
     if x is None or isinstance(x, (str, bool)):
         return "nothing (is a return missing?)" if x is None else f"a {type(x).__name__}"
-    try:
-        shape = np.asarray(_plain(x), dtype=float).shape
-    except (TypeError, ValueError):
+    if (array := _numbers(x)) is None:
         return f"a {type(x).__name__} that is no array of numbers"
-    return f"an array of shape {shape}" if shape else "a number"
+    return f"an array of shape {array.shape}" if array.shape else "a number"
 
 
 def _shown(x: Any, digits: int) -> str:

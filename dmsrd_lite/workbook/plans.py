@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import partial
 from glob import glob
 from hashlib import sha256
 from itertools import product
@@ -223,7 +222,11 @@ def _has(run: Run, pair: str) -> bool:
 
 
 def _perform(plan: Plan, todo: list[Run], workers: int, scheduler: str) -> None:
-    """Dask keeps the queue, and begins a run anew when its worker dies; an answer is recorded as it comes."""
+    """Give Dask a run for each of its threads, and record each answer as it comes.
+
+    Dask begins a run anew when its worker dies, and counts that death against every run that waits there: so
+    none does, or a neighbour's killed workers would be the end of an innocent one.
+    """
     from distributed import CancelledError, wait
     from distributed.comm import CommClosedError
     from filelock import FileLock, Timeout
@@ -233,23 +236,24 @@ def _perform(plan: Plan, todo: list[Run], workers: int, scheduler: str) -> None:
     lock = FileLock(plan.folder / ".lock", timeout=0)  # it ends with the process, however that ends
     n_workers = min(workers or max(1, (os.cpu_count() or 2) // 2), len(todo))  # a lesson uses two cores
     try:
-        bar = partial(tqdm, total=len(todo), unit="run", smoothing=0)
-        with lock, _client(n_workers, scheduler) as client, bar() as progress:
+        with (
+            lock,
+            _client(n_workers, scheduler) as client,
+            tqdm(total=len(todo), unit="run", smoothing=0) as bar,
+        ):
             left, running = todo[::-1], dict[Any, Run]()
             while left or running:
-                # No run waits at a worker: Dask would count a neighbour's killed workers against it, too
                 while left and len(running) < max(1, sum(client.ncores().values())):
                     future = client.submit(perform, left[-1], plan.cell_seconds, os.getcwd(), pure=False)
                     running[future] = left.pop()
                 with suppress(TimeoutError):  # then look whether workers have come
                     wait(list(running), timeout=5, return_when="FIRST_COMPLETED")
-                for future in [future for future in running if future.done()]:
+                for future in [one for one in running if one.done()]:
                     error = future.exception()
-                    _record(
-                        plan, running.pop(future), {"error": in_one_line(error)} if error else future.result()
-                    )
+                    answer = {"error": in_one_line(error)} if error else future.result()
+                    _record(plan, running.pop(future), answer)
                     future.release()  # or Dask would run it again when the worker that holds the answer dies
-                    progress.update()
+                    bar.update()
     except Timeout:
         raise InputError(f"{plan.folder}: another run of this plan goes on; expected one at a time") from None
     except (CancelledError, CommClosedError):

@@ -27,6 +27,7 @@ from dmsrd_lite.workbook.execution import handed_over, perform
 from dmsrd_lite.workbook.records import MIME, ROOT
 
 TWO_SEEDS = "[grid]\nseed = [0, 1]"
+ONE_THREAD = ("--nthreads", "1", "--memory-limit", "0")  # of a Dask worker
 OUT = Path("out")
 PARAMETERS = 'domain: str = "inverted_pendulum"\npreset: str = "quick"\nseed: int = 0\nscale = 1.0\nodd = 2*3'
 SQUARE = f"""
@@ -109,9 +110,6 @@ def hand_started_cluster(n_workers):
         for _ in range(n_workers):
             workers.enter_context(dask("worker", address, *ONE_THREAD))
         yield scheduler, address
-
-
-ONE_THREAD = ("--nthreads", "1", "--memory-limit", "0")
 
 
 @contextmanager
