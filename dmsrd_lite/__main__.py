@@ -47,8 +47,10 @@ def _convert(arguments: argparse.Namespace) -> int:
 
     domain = get_domain(arguments.domain) if arguments.domain else None
     target, source = Path(arguments.file).resolve(), Path(arguments.source).resolve()
-    if target.suffix != ".npz" or target == source:
-        raise InputError(f"{target}: is what is to be written; expected another file, with the ending .npz")
+    if target.suffix != ".npz":
+        raise InputError(f"{target}: is to be written; expected a name with the ending .npz")
+    if target == source:
+        raise InputError(f"{target}: is what is read, too; expected another file to be written")
     found, notes = convert(arguments.source, domain, arguments.each, arguments.steps)
     path = save_demonstrations(arguments.file, found)
     n, k, t = found.actions.shape[:3]

@@ -159,7 +159,8 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
 
 def _read_metadata(arrays: dict, known: dict[str, Domain]) -> tuple[dict, list[str]]:
     if "metadata" not in arrays:
-        return {}, ["metadata: is missing; expected a JSON text with domain and schema_version"]
+        text = "expected a JSON text with domain and schema_version (plain arrays: convert them first)"
+        return {}, [f"metadata: is missing; {text}"]
     try:
         metadata = json.loads(str(arrays["metadata"]))
         assert isinstance(metadata, dict)

@@ -11,6 +11,8 @@ from pathlib import Path
 import nbformat
 import pytest
 import torch
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
 
 from dmsrd_lite.workbook import classroom
 from dmsrd_lite.workbook.exercises import check
@@ -94,6 +96,34 @@ def test_a_wrong_answer_gets_the_hint_that_names_it(lesson):
     assert all(len(names) == 1 for names in own.values()), own
 
 
+def answers(lesson):
+    """The reference's answers: (task, the name of a function in it, code)."""
+    for about, source in code(master(lesson)):
+        if about.get("solution"):
+            for name in re.findall(r"^def (\w+)", source, re.M):
+                yield about["grade_id"], name, source
+
+
+@each_lesson
+def test_an_answer_that_returns_nothing_gets_a_sentence(lesson):
+    for task, name, source in answers(lesson):
+        nothing = f"{source}\n\n\ndef {name}(*_, **__):\n    pass\n"
+        said = graded(master(lesson), {task: nothing})[task]
+        assert said is not None, f"{task}: nothing earns full points"
+        assert said.startswith("AssertionError"), f"{task}: {said}"
+
+
+@each_lesson
+def test_a_list_does_where_a_tuple_is_asked_for(lesson):
+    listed = (
+        "\n\n\ndef {0}(*of, right={0}):\n    x = right(*of)\n    return [*x] if type(x) is tuple else x\n"
+    )
+    as_lists: dict[str, str] = {}
+    for task, name, source in answers(lesson):
+        as_lists[task] = as_lists.get(task, source) + listed.format(name)
+    assert set(graded(master(lesson), as_lists).values()) == {None}
+
+
 @each_lesson
 def test_an_exercise_has_what_was_promised(lesson):
     notebook = master(lesson)
@@ -136,7 +166,9 @@ def test_student_copies_are_up_to_date_and_hold_no_solution(tmp_path):
         ("1.0", 1.0, "a str; expected a number"),
         ((1.0, [2.0]), (1.0, [3.0]), "expected"),
         ([torch.tensor(1.0, requires_grad=True), torch.tensor(2.0)], [1.0, 2.0], None),
-        ([None, 1.0], [1.0, 2.0], "None"),
+        ([None, 1.0], [1.0, 2.0], "None in it .is a return missing"),
+        ([1.0, [2.0]], (1.0, [2.0]), None),
+        ([1.0], (1.0, [2.0]), "a tuple of 1; expected a tuple of 2"),
         ([[1.0], [1.0, 2.0]], [1.0, 2.0], "a list that is no array of numbers"),
     ],
 )
@@ -153,3 +185,44 @@ def test_a_check_lets_small_differences_pass():
     check([1.0, 2.0 + 1e-8], [1.0, 2.0])
     check((1.0, None), (1.0, None))
     check(0.41, 0.4101, tolerance=1e-3)
+
+
+ANSWERS = """
+def stub():
+    raise NotImplementedError("not yet")
+def two(ask=None):
+    return ask() if ask else 2
+def slip():
+    return unknown
+"""
+CHECK = "from dmsrd_lite.workbook.exercises import check\n{}\n'the answer is 42'"
+
+
+def test_a_notebook_shows_a_sentence_or_the_answers_own_lines_and_the_cell_has_failed():
+    shown = {
+        "check(stub(), 42)": "NotImplementedError: not yet",
+        "check(two(), 42, {'The half.': 2})": "AssertionError: The half.",
+        "assert two() == 42, 'Not two.'": "AssertionError: Not two.",
+        "check(slip(), 42)": "    return unknown",
+        "two(lambda: 1 / 0)": "    return ask() if ask else 2",
+        "two(1, 42)": "TypeError: two() takes from 0 to 1 positional arguments but 2 were given",
+    }
+    cells = [nbformat.v4.new_code_cell(source) for source in (ANSWERS, *map(CHECK.format, shown), "slip()")]
+    quiet = ["--IPKernelApp.log_level=40"]  # it warns of its sockets
+    client = NotebookClient(
+        nbformat.v4.new_notebook(cells=cells), allow_errors=True, extra_arguments=quiet, timeout=60
+    )
+    client.execute()
+    said = []
+    for cell in cells[1:]:
+        (output,) = cell.outputs
+        assert output.output_type == "error"
+        said.append(re.sub(r"\x1b\[[\d;]*m", "", "\n".join(output.traceback)))
+    for text, words in zip(said, shown.values(), strict=False):
+        assert words in text
+        assert "42" not in text.replace(words, "")
+        assert ("\n" in text) == words.startswith(" ")
+    assert "----> 1 slip()" in said[-1], "one's own cell is no check"
+    client.allow_errors = False
+    with pytest.raises(CellExecutionError):
+        client.execute()

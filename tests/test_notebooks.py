@@ -3,7 +3,8 @@
 import nbformat
 import pytest
 
-from dmsrd_lite.demonstrations import DATA_FOLDER
+from dmsrd_lite.beyond.conversion import convert
+from dmsrd_lite.demonstrations import DATA_FOLDER, save_demonstrations
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.workbook.execution import execute, handed_over
 from dmsrd_lite.workbook.lessons import NOTEBOOKS, lessons
@@ -48,6 +49,28 @@ def run_first_cells(name, parameters):
 SHIPPED = str(DATA_FOLDER / "inverted_pendulum_demonstrations.npz")
 
 
+@pytest.mark.lesson
+@pytest.mark.verify
+def test_a_lesson_with_short_demonstrations_of_ones_own(tmp_path):
+    mine = save_demonstrations(tmp_path / "mine.npz", convert(SHIPPED, steps=12)[0].select(range(3)))
+    parameters = {"preset": "quick", "demonstrations_path": str(mine)}
+    error, _ = execute(NOTEBOOKS / "06_dmsrd.ipynb", tmp_path / "out.ipynb", parameters)
+    assert error == ""
+
+
+@pytest.mark.lesson
+@pytest.mark.verify
+@pytest.mark.parametrize("domain", ["inverted_pendulum"])
+def test_the_benchmark_is_read_from_its_records(domain, tmp_path):
+    """Nothing is trained: the tables and figures of all trials."""
+    parameters = {"domain": domain, "preset": "full"}
+    error, _ = execute(NOTEBOOKS / "07_benchmark.ipynb", tmp_path / "out.ipynb", parameters)
+    assert error == ""
+    found = handed_over(nbformat.read(tmp_path / "out.ipynb", 4))
+    assert found["trials"] == 3
+    assert len(found["summary"]["KL"]) == 14  # two starts of six methods, cloning, and the people themselves
+
+
 @pytest.mark.parametrize(
     ("name", "parameters", "sentence"),
     [
@@ -83,6 +106,7 @@ SHIPPED = str(DATA_FOLDER / "inverted_pendulum_demonstrations.npz")
         ),
         ("08_lifelong_100", {"part": "orders"}, "part 'orders' with quick: expected preset full"),
         ("07_benchmark", {"record": True}, "record=True without part: expected one"),
+        ("08_lifelong_100", {"record": True}, "record=True with quick: expected preset full, a record is of"),
     ],
 )
 def test_a_bad_parameter_ends_the_lesson_at_its_start(name, parameters, sentence, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ Plain arrays (``.npz``), the folder of a Minari dataset, and the folder of traje
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,11 @@ class Episode:
     rewards: np.ndarray | None = None  # (T,)
     reset_seed: int | None = None  # a rollout can start as it did
     over: bool = False  # it ended because the task was over, not because the time was
+
+    @property
+    def lengths(self) -> tuple[int, int]:
+        """The numbers of states and of actions."""
+        return len(self.observations), 0 if self.actions is None else len(self.actions)
 
 
 def convert(
@@ -48,7 +53,7 @@ def convert(
         )
     domain = domain or _domain_of(path, episodes[0])
     for i, episode in enumerate(episodes):
-        if fault := _fault(episode, domain, steps, len(episodes[0].observations)):
+        if fault := _fault(episode, domain, steps, episodes[0].lengths):
             raise InputError(f"{path}: episode {i}: {fault}")
     kept: dict[str, Any] = {
         name: _stack([getattr(e, name) for e in episodes], each, steps)
@@ -59,19 +64,51 @@ def convert(
         kept["reset_seeds"] = np.array([e.reset_seed for e in episodes]).reshape(-1, each)
     states = [e.observations for e in episodes]
     kept["observations"] = _stack(states, each, steps + 1 if steps else 0)
-    notes = []
-    if any(some.dtype.itemsize < 8 for some in states):
-        notes.append("observations are of single precision or less: states nearer than that look the same")
-    if "rewards" not in kept:
-        notes.append("there are no rewards: returns are unknown, and nothing that learns needs them")
-    if each == 1:
-        notes.append(
-            "one trajectory per person: no floor, eps is a guess (lesson 06); --each K joins K of them"
-        )
     found = DemonstrationSet(domain, **kept, metadata={"source": path.name})
     if faults := found.faults():
         raise InputError(f"{path}: {faults[0]}")
-    return found, notes
+    return found, [*_notes(found, min(some.dtype.itemsize for some in states))]
+
+
+def _notes(found: DemonstrationSet, n_bytes: int) -> Iterator[str]:
+    """What a reader should know; above all what says that these numbers mean something else than here."""
+    domain, states = found.domain, found.observations
+    outside = (np.clip(states, domain.observation_low, domain.observation_high) != states).any(-1).mean()
+    if outside:
+        bounds = f"{domain.observation_low} to {domain.observation_high}"
+        yield f"{outside:.1%} of the states lie outside {bounds}, and are clipped: other units or columns?"
+    rewards = np.zeros(found.actions.shape[:3]) if found.rewards is None else found.rewards
+    new = states[:, :, states.shape[2] - found.horizon :]
+    failed = domain.failed(new, rewards[:, :, : new.shape[2]]).any(-1)
+    if failed.any():
+        yield f"{failed.sum()} of {failed.size} episodes fail ({domain.failure_text}): that is learned, too"
+    if found.reset_seeds is None:
+        if domain.comparison.matched_starts:
+            text = f"a KL on {domain.name} is then that of the starts, too, and eps is looser"
+            yield f"there are no reset_seeds: rollouts start elsewhere; {text}"
+    elif (gap := _replay_gap(found, found.reset_seeds)) > 1e-3:
+        text = f"states {gap:.2g} of their scale away from the file's: other seeds, time step or columns?"
+        yield f"its actions, replayed from its reset_seeds, lead to {text}"
+    if n_bytes < 8:
+        yield "observations are of single precision or less: states nearer than that look the same"
+    if found.rewards is None:
+        yield "there are no rewards: returns are unknown, and nothing that learns needs them"
+    else:
+        yield f"rewards are kept as they are; the task here pays {domain.reward_text}"
+    if found.actions.shape[1] == 1:
+        yield "one trajectory per person: no floor, eps is a guess (lesson 06); --each K joins K of them"
+
+
+def _replay_gap(found: DemonstrationSet, reset_seeds: np.ndarray, n_steps: int = 20) -> float:
+    """How far the simulator comes away from the first states of the file, in units of their scale."""
+    (n, k), domain = found.actions.shape[:2], found.domain
+    batch = domain.simulator.make_batch(n * k, 1)
+    states, gap = batch.reset(reset_seeds.ravel()), 0.0
+    for t in range(min(n_steps, found.horizon)):
+        apart = states - found.observations[:, :, t].reshape(n * k, -1)
+        gap = max(gap, float(np.abs(apart / domain.observation_scale).max()))
+        states = batch.step(found.actions[:, :, t].reshape(n * k, -1))[0]
+    return gap
 
 
 def _stack(parts: Sequence[np.ndarray], each: int, n: int) -> np.ndarray:
@@ -81,9 +118,10 @@ def _stack(parts: Sequence[np.ndarray], each: int, n: int) -> np.ndarray:
 
 
 def _domain_of(path: Path, episode: Episode) -> Domain:
-    if episode.actions is not None and episode.actions.ndim != 2:
-        shape = f"has actions of shape {episode.actions.shape} in an episode"
-        raise InputError(f"{path}: {shape}; expected (steps, dimension), of continuous actions")
+    for name, part in (("observations", episode.observations), ("actions", episode.actions)):
+        if part is not None and part.ndim != 2:
+            shape = f"has {name} of shape {part.shape} in an episode"
+            raise InputError(f"{path}: {shape}; expected (steps, dimension), of continuous {name}")
     acted = 0 if episode.actions is None else episode.actions.shape[-1]
     found = [d for d in DOMAINS.values() if d.obs_dim == episode.observations.shape[-1]]
     fits = [d for d in found if episode.actions is None or d.action_dim == acted]
@@ -94,7 +132,7 @@ def _domain_of(path: Path, episode: Episode) -> Domain:
     return fits[0]
 
 
-def _fault(episode: Episode, domain: Domain, steps: int, n_states: int) -> str:
+def _fault(episode: Episode, domain: Domain, steps: int, first: tuple[int, int]) -> str:
     """What is wrong with an episode; nothing if it can be used."""
     states, actions, rewards = episode.observations, episode.actions, episode.rewards
     if actions is None or not len(actions):
@@ -120,10 +158,9 @@ def _fault(episode: Episode, domain: Domain, steps: int, n_states: int) -> str:
         return f"ended early, after {t} steps; {go_on}"
     if t > domain.horizon:
         return f"has {t} steps; expected at most {domain.horizon}, or --steps {domain.horizon} to cut them"
-    if len(states) != n_states:
-        return (
-            f"has {len(states)} states, the first has {n_states}; expected equally long episodes, or --steps"
-        )
+    if episode.lengths != first:
+        found = "has {} states and {} actions, the first has {} and {}".format(*episode.lengths, *first)
+        return f"{found}; expected equally long episodes, or --steps"
     return ""
 
 
@@ -197,8 +234,11 @@ def _from_minari(folder: Path) -> list[Episode]:
     except (OSError, ValueError, KeyError) as error:
         what = f"cannot be read ({type(error).__name__})"
         raise InputError(f"{folder}: {what}; expected a whole Minari dataset") from None
-    if any(isinstance(e.observations, dict | tuple) for e in episodes):
-        raise InputError(f"{folder}: observations have parts; expected one vector for every step")
+    for name in ("observations", "actions"):
+        for part in (getattr(e, name) for e in episodes):
+            if not isinstance(part, np.ndarray):  # but a dict or tuple of parts, or a list of texts
+                what = f"{name} come as a {type(part).__name__}"
+                raise InputError(f"{folder}: {what}; expected one vector of numbers for every step")
     return [Episode(e.observations, e.actions, e.rewards, over=any(e.terminations)) for e in episodes]
 
 

@@ -30,6 +30,13 @@ AS_PRINTED: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class DMSRDSettings:
+    """What is done with a demonstration; a comment in the source stands beside each field.
+
+    ``kl_threshold``: eps in nats, a mixture below it is taken; 0: ``kl_margin`` nats above a reference.
+    ``airl``: training of a new strategy; ``msrd``: of a round; ``mixture``: the search for weights. The other
+    fields say where ours deviates from the paper (``as_printed`` takes all that back).
+    """
+
     kl_threshold: float = 0.0  # eps: a mixture is accepted below it (nats); 0: a reference + kl_margin
     kl_margin: float = 0.5  # nats above the reference (``kl_threshold.reference_divergence``)
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
@@ -83,7 +90,13 @@ def learn(state: State, demonstrations: DemonstrationSet, settings: DMSRDSetting
     says why.
 
     A state is replaced, never changed: an error leaves the last one as it was, and any of them can be gone on
-    from.
+    from, with demonstrations that it does not know yet.
+
+    record (a dict, ``state.records[-1]``): branch (``MIXTURE``, ``BETTER_MIXTURE``, ``NEW_STRATEGY``);
+    kl_mix, kl_new, threshold (eps) and reference in nats, None where it was not asked for;
+    weights (M,); n_strategies; remembered, kl_before_round, kl_after_round, searched_again and recognized of
+    the round (``play_round``); steps of the environment, by use; seconds. A kl_new far above the threshold:
+    even the new strategy does not do what was shown.
     """
     for i in range(demonstrations.n_demonstrations):
         state = learn_one(state, demonstrations.select([i]), settings)
@@ -140,6 +153,10 @@ def _check(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> None
     name, known = state.domain.name, state.demonstrations
     if new.domain.name != name:
         raise InputError(f"a demonstration of {new.domain.name} arrived; expected one of {name}")
+    if (n := new.n_demonstrations) != 1:
+        raise InputError(f"{n} demonstrations arrived together; expected one (learn takes several)")
+    if faults := new.faults():
+        raise InputError(f"demonstration {len(state.weights)} cannot be learned from: {faults[0]}")
     for array in ("observations", "actions") if known is not None else ():
         before, now = (getattr(some, array).shape[1:] for some in (known, new))
         if before != now:

@@ -21,7 +21,12 @@ Module = TypeVar("Module", bound=torch.nn.Module)
 
 @dataclass(frozen=True)
 class State:
-    """All that is known after n demonstrations and M strategies; never changed, only replaced."""
+    """All that is known after n demonstrations and M strategies; never changed, only replaced.
+
+    ``State(domain, seed)`` knows nothing yet. ``weights`` (n, M) say of what mixture each demonstration is,
+    ``pure[j]`` which demonstration created strategy j, ``records`` why (``dmsrd.learn``); ``policies()``,
+    ``rewards()`` and ``mixtures()`` give what was learned.
+    """
 
     domain: Domain
     seed: int

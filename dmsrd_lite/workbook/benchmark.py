@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ METRICS = {
 }
 PUBLISHED = {"published_return": "return", "published_log_likelihood": "log-likelihood", "divergence": "KL"}
 CORRELATIONS = {"pearson": "Pearson", "spearman": "Spearman", "spearman_of_good": "Spearman of the good"}
+_pearson = itemgetter("pearson")
 SHARED = ("AIRL Batch", "MSRD", "DMSRD without BCD", "DMSRD as printed", "DMSRD")  # one reward for all
 OURS, RIVALS = ("DMSRD as printed", "DMSRD"), ("AIRL Single", "MSRD")
 TRIALS = (0, 1, 2)
@@ -75,13 +77,16 @@ class Benchmark:
     known: dict[int, dict[str, Any]]  # of each trial, in order: arrival, floor, the demonstrators' own scores
 
     def budgets(self, method: str, start: str) -> list[int]:
-        return sorted({row[3] for row in self.rows if row[1:3] == (method, start)})
+        """Those at which every trial scored it."""
+        of_any = {budget for _, *who, budget in self.rows if who == [method, start]}
+        return sorted(b for b in of_any if all((k, method, start, b) in self.rows for k in self.known))
 
     def per_trial(self, method: str, start: str, budget: int) -> list[dict[str, Any]]:
         """The scores of every trial; ``InputError`` where the records do not hold this."""
         rows = [(trial, method, start, budget) for trial in self.known]
-        if not set(rows) <= set(self.rows):
+        if missing := [str(row[0]) for row in rows if row not in self.rows]:
             text = f"{method} from {start} was not scored at {budget:,} steps per demonstration"
+            text += f" in trial {', '.join(missing)}"
             held = ", ".join(f"{b:,}" for b in self.budgets(method, start)) or "nothing of it"
             raise InputError(f"{text}; expected one of the budgets that the records hold: {held}")
         return [self.rows[row] for row in rows]
@@ -108,12 +113,12 @@ class Benchmark:
         return [float(value(row)) for row in self.per_trial(*entry)]
 
 
-def by_person(values: ArrayLike, people: Sequence[int]) -> np.ndarray:
+def by_person(values: ArrayLike, people: ArrayLike) -> np.ndarray:
     """Means over what one person has in several trials, which is not independent: (people,)."""
-    return pd.Series(values, dtype=float).groupby(list(people)).mean().to_numpy()
+    return pd.Series(values, dtype=float).groupby(np.asarray(people)).mean().to_numpy()
 
 
-def over_people(values: ArrayLike, people: Sequence[int]) -> tuple[float, float, float]:
+def over_people(values: ArrayLike, people: ArrayLike) -> tuple[float, float, float]:
     """Mean and 95 % bootstrap interval over people (``by_person``)."""
     each = by_person(values, people)
     return float(each.mean()), *mean_interval(each)
@@ -142,26 +147,36 @@ def collect(domain: Domain, trials: Iterator[tuple[int, dict[str, Any]]]) -> Ben
 
 
 def load(domain: Domain, settings: BenchmarkLesson, folder: Path = RECORDS) -> Benchmark:
-    """The committed records of all trials; ``InputError`` when one is missing or of other settings."""
+    """The committed records of all trials; ``InputError`` when one is missing, holds less than its part, or
+    was made with other settings or versions than the rest."""
+    again, versions = "expected records of one plan: run it again", dict[str, str]()
 
     def results() -> Iterator[tuple[int, dict[str, Any]]]:
-        for trial in TRIALS:
-            for part in BENCHMARK:
-                name = record_name(domain.name, part, trial)
-                if not (folder / f"{name}.json").exists():
-                    plan = f"papermill_runs/plans/benchmark_{domain.name}.toml"
-                    raise InputError(f"record {name} is missing; expected all trials: run {plan}")
-                record, _ = load_record(name, folder)
-                if record["settings"] != settings_of(settings):
-                    text = f"record {name} was made with other settings than this lesson's"
-                    raise InputError(f"{text}; expected records of one plan: run it again")
-                for label, rows in record["results"]["scores"].items():
-                    method, start = label.split(", ")
-                    row = rows.get(str(settings.main), {})
-                    if method in SHARED and start == "nothing" and "worth" not in row:
-                        text = f"record {name} does not say what the task reward of {label} teaches"
-                        raise InputError(f"{text}; expected records of one plan: run it again")
-                yield trial, record["results"]
+        for trial, part in product(TRIALS, BENCHMARK):
+            name = record_name(domain.name, part, trial)
+            if not (folder / f"{name}.json").exists():
+                plan = f"papermill_runs/plans/benchmark_{domain.name}.toml"
+                raise InputError(f"record {name} is missing; expected all trials: run {plan}")
+            record, _ = load_record(name, folder)
+            said = {key: record["parameters"].get(key) for key in ("domain", "part", "seed")}
+            if list(said.values()) != [domain.name, part, trial]:
+                raise InputError(f"record {name} says that it is of {said}; expected what its name says")
+            if record["settings"] != settings_of(settings):
+                raise InputError(f"record {name} was made with other settings than this lesson's; {again}")
+            for package, number in record["versions"].items():
+                if versions.setdefault(package, number) != number:
+                    text = f"was made with {package} {number}, another with {versions[package]}"
+                    raise InputError(f"record {name} {text}; {again}")
+            for method, start in BENCHMARK[part]:
+                rows = record["results"]["scores"].get(f"{method}, {start}", {})
+                for budget in settings.scored_at(method, start, part):
+                    if str(budget) not in rows:
+                        text = f"does not hold {method} from {start} at {budget:,} steps"
+                        raise InputError(f"record {name} {text}; {again}")
+                if method in SHARED and start == "nothing" and "worth" not in rows[str(settings.main)]:
+                    text = f"does not say what the task reward of {method}, {start} teaches"
+                    raise InputError(f"record {name} {text}; {again}")
+            yield trial, record["results"]
 
     return collect(domain, results())
 
@@ -171,8 +186,7 @@ def entries(found: Benchmark, settings: BenchmarkLesson) -> list[Entry]:
 
     All rows there are if none has it, as where the control alone was trained.
     """
-    main = {"clone": settings.from_clone, "nothing": settings.main}
-    pairs = [(method, start, budget) for start, budget in main.items() for method in METHODS]
+    pairs = [(method, start, budget) for start, budget in settings.budget_of.items() for method in METHODS]
     at_main = [(m, s, budget) for m, s, budget in pairs if budget in found.budgets(m, s)]
     return at_main or [(method, start, budget) for _, method, start, budget in found.rows]
 
@@ -259,10 +273,12 @@ def rescued(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     return pd.DataFrame(lines, columns=header).round({name: 1 for name in header[4:]})
 
 
-def ranks(found: Benchmark, entries: Sequence[Entry], metric: str) -> Ranks:
-    """The methods ranked within each person of each trial."""
+def ranks(found: Benchmark, entries: Sequence[Entry], metric: str, of_people: bool = True) -> Ranks:
+    """The methods ranked within each person, whose trials are averaged first; or, as the paper seems to do,
+    within each person of each trial."""
     table = [found.values(*entry, metric) for entry in entries]
-    return rank_methods(np.array(table).T, METRICS[metric][1])
+    rows = [by_person(values, found.people) for values in table] if of_people else table
+    return rank_methods(np.array(rows).T, METRICS[metric][1])
 
 
 def friedman(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
@@ -275,8 +291,9 @@ def friedman(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
         at = {e[0]: i for i, e in enumerate(three)}
         tests = PAPER_TESTS[found.domain.name]
         for (metric, (title, _)), (q, p, *pairs) in zip(METRICS.items(), tests, strict=True):
-            result = ranks(found, three, metric)
+            result, of_people = ranks(found, three, metric, False), ranks(found, three, metric)
             told = {"Q(2)": round(result.q, 1), "paper's Q": q, "p": round(result.p, 3), "paper's p": p}
+            told["p, people"] = round(of_people.p, 3)
             for rival, theirs in zip(RIVALS, pairs, strict=True):
                 told[f"p against {rival}"] = round(result.pairwise_p[at[rival], at[OURS[0]]], 3)
                 told[f"paper's against {rival}"] = theirs
@@ -302,7 +319,7 @@ def fisher(found: Benchmark, entries: Sequence[Entry], n: int) -> pd.DataFrame:
     lines = {}
     for one in (e for e in entries if e[0] in OURS):
         for other in (e for e in entries if e[1] == one[1] and e[0] in SHARED[:3]):
-            pairs = zip(*(found.over_trials(e, itemgetter("pearson")) for e in (one, other)), strict=True)
+            pairs = zip(*(found.over_trials(e, _pearson) for e in (one, other)), strict=True)
             z = [compare_correlations(a, b, n, n)[0] for a, b in pairs]
             lines[f"{one[0]} - {other[0]}, {one[1]}"] = dict(zip(found.known, z, strict=True))
     return pd.DataFrame(lines).T.round(1)
@@ -331,12 +348,16 @@ def recognition(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
     """How many strategy rewards rank their own person first, by the takes they are asked on; all trials."""
 
     def line(entry: Entry) -> dict[str, str]:
-        rows = found.per_trial(*entry)
-        of = sum(len(row["pure"]) for row in rows)
-        takes = rows[0].get("recognized_fresh", ())
-        return {take: f"{sum(row['recognized_fresh'][take] for row in rows)} of {of}" for take in takes}
+        takes = found.per_trial(*entry)[0].get("recognized_fresh", ())
+        return {take: _counted(found, entry, take) for take in takes}
 
     return _table(entries, line)
+
+
+def _counted(found: Benchmark, entry: Entry, take: str) -> str:
+    """How many of how many strategy rewards know their person on these takes, all trials together."""
+    rows = found.per_trial(*entry)
+    return f"{sum(row['recognized_fresh'][take] for row in rows)} of {sum(len(row['pure']) for row in rows)}"
 
 
 def cost(found: Benchmark, entries: Sequence[Entry]) -> pd.DataFrame:
@@ -460,35 +481,91 @@ def _of_rewards(
     found: Benchmark, entry: Entry, there: dict[str, Entry], most: int
 ) -> Iterator[tuple[str, ...]]:
     """Claims 3, 4 and 5, trial by trial; what BCD does only of ours, which has a twin without it."""
-    correlation, known, twin = itemgetter("pearson"), partial(_recognized, most), "DMSRD without BCD"
+    correlation, known, twin = _pearson, partial(_recognized, most), "DMSRD without BCD"
+    share = "a larger share of its strategies recognised"
     claims: list[tuple[str, str, str, Callable]] = [
         ("3", "stronger correlation", "AIRL Batch", correlation),
         ("3", "stronger correlation", "MSRD", correlation),
-        ("4", "more strategies recognised", "AIRL Single", known),
-        ("4", "more strategies recognised", "MSRD", known),
+        ("4", share, "AIRL Single", known),
+        ("4", share, "MSRD", known),
     ]
     if entry[0] == "DMSRD":
-        claims.append(("4", "more strategies recognised", twin, known))
+        claims.append(("4", share, twin, known))
         claims.append(("5", "BCD: stronger correlation", twin, correlation))
     for number, says, rival, value in claims:
         if rival in there:
             gaps, told = _by_trials(found, entry, there[rival], value)
-            yield number, says, rival, ", ".join(f"{gap:+.3f}" for gap in gaps), told, ""
+            numbers = ", ".join(f"{gap:+.3f}" for gap in gaps)
+            if number == "4":
+                numbers += " ({} against {})".format(
+                    *(_counted(found, e, str(most)) for e in (entry, there[rival]))
+                )
+            yield number, says, rival, numbers, told, ""
 
 
-def equal_steps(found: Benchmark, share: int, main: int) -> pd.DataFrame:
-    """The control of what DMSRD's rounds cost: AIRL Single with ``share`` steps for each person, as DMSRD's
-    AIRL has, beside both with ``main`` steps; then DMSRD's minus the control's, and the verdict."""
-    control, ours = ("AIRL Single", "nothing", share), ("DMSRD", "nothing", main)
-    rows = {
-        f"{m}, {b / 1e6:.2f} M": (m, s, b) for m, s, b in (control, ours, ("AIRL Single", "nothing", main))
-    }
+def equal_steps(found: Benchmark, settings: BenchmarkLesson) -> pd.DataFrame:
+    """The control of what DMSRD's rounds cost: AIRL Single with the steps for each person that DMSRD's AIRL
+    has, beside DMSRD and AIRL Single with the usual budget; DMSRD's minus the control's, and the verdict."""
     table = {}
-    for metric, (title, larger) in METRICS.items():
-        gap = found.difference(ours, control, metric)
-        means = {name: f"{found.values(*entry, metric).mean():.2f}" for name, entry in rows.items()}
-        table[title] = means | {"difference": _with_interval(gap), "better": verdict(gap, larger)}
+    for start, budget in settings.budget_of.items():
+        control, ours = ("AIRL Single", start, settings.share(start)), ("DMSRD", start, budget)
+        rows = {"AIRL Single, fewer steps": control, "DMSRD": ours, "AIRL Single": (*control[:2], budget)}
+        if all(entry[2] in found.budgets(*entry[:2]) for entry in rows.values()):
+            for metric, (title, larger) in METRICS.items():
+                means = {name: f"{found.values(*e, metric).mean():.2f}" for name, e in rows.items()}
+                gap = found.difference(ours, control, metric)
+                told = {"difference": _with_interval(gap), "better": verdict(gap, larger)}
+                table[f"{title}, {start} ({control[2] / 1e6:.2f} M)"] = means | told
     return pd.DataFrame(table).T
+
+
+def lost(found: Benchmark, entries: Sequence[Entry], settings: BenchmarkLesson) -> pd.DataFrame:
+    """Every score that DMSRD loses to somebody from the same start, and what the records say of the reason.
+
+    Of a person's score against AIRL Single: are the steps that the rounds take enough (``equal_steps``)?
+    Against others: does AIRL Single lose it, too, so that neither strategies nor mixtures are to blame? If
+    not: is it lost by those who became a strategy of their own? Of the task reward: does the twin without BCD
+    lose it? "Enough" and "not lost" are what the interval allows, no proof.
+    """
+    twin = "DMSRD without BCD"
+
+    def of_strategies(one: Entry, other: Entry, metric: str) -> bool:
+        rows = found.per_trial(*one)
+        own = np.concatenate([np.isin(np.arange(len(row[metric])), row["pure"]) for row in rows])
+        if own.sum() < 2:
+            return True
+        gaps = (found.values(*one, metric) - found.values(*other, metric))[own]
+        return verdict(over_people(gaps, np.array(found.people)[own]), METRICS[metric][1]) == VERDICTS[2]
+
+    def loses(one: Entry, other: Entry, metric: str) -> bool:
+        if metric == "pearson":
+            return _by_trials(found, one, other, _pearson)[1] == VERDICTS[2]
+        return verdict(found.difference(one, other, metric), METRICS[metric][1]) == VERDICTS[2]
+
+    def why(one: Entry, there: dict[str, Entry], rival: str, metric: str) -> str:
+        other, control = there[rival], ("AIRL Single", one[1], settings.share(one[1]))
+        if metric == "pearson":
+            if one[0] == "DMSRD" and twin in there:
+                also = loses(there[twin], other, metric)
+                return "not BCD: without it, too" if also else "BCD: without it this is not lost"
+        elif rival == "AIRL Single":
+            asked = one[0] == "DMSRD" and control[2] in found.budgets(*control[:2])
+            if asked and not loses(one, control, metric):
+                return "the missing steps are enough"
+        elif "AIRL Single" in there and loses(there["AIRL Single"], other, metric):
+            return "AIRL: AIRL Single loses it, too"
+        if metric in METRICS and not of_strategies(one, other, metric):
+            return "mixtures: strategies do not lose it"
+        return "not known"
+
+    titles, lines = {m: title for m, (title, _) in METRICS.items()} | {"pearson": "Pearson of R_Task"}, []
+    for one in (e for e in entries if e[0] in OURS):
+        there = {e[0]: e for e in entries if e[1] == one[1]}
+        for rival in (name for name in there if name not in (*OURS, twin)):
+            for metric, title in titles.items():
+                if (metric in METRICS or rival in SHARED) and loses(one, there[rival], metric):
+                    lines.append((f"{one[0]}, {one[1]}", rival, title, why(one, there, rival, metric)))
+    return pd.DataFrame(lines, columns=["method", "loses to", "in", "because"]).set_index("method")
 
 
 def standing(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFrame:
@@ -497,14 +574,14 @@ def standing(found: Benchmark, entries: Sequence[Entry], most: int) -> pd.DataFr
     table: dict[str, dict[str, str]] = {}
     words = {"holds": "better", "does not hold": "worse", "a tie": "a tie"}
     of_rewards: dict[str, Callable] = {
-        "Pearson of R_Task": itemgetter("pearson"),
+        "Pearson of R_Task": _pearson,
         "recognised": partial(_recognized, most),
     }
     for entry in (e for e in entries if e[0] in OURS):
         for rival in (e for e in entries if e[1] == entry[1] and e[0] in (*RIVALS, "AIRL Batch")):
             told = {t: verdict(found.difference(entry, rival, m), up) for m, (t, up) in METRICS.items()}
             for title, value in of_rewards.items():
-                if title != "recognised" or rival[0] != "AIRL Batch":  # which has no strategy rewards
+                if rival[0] in SHARED if value is _pearson else rival[0] != "AIRL Batch":  # who has which
                     _, told[title] = _by_trials(found, entry, rival, value)
             table[f"{entry[0]} against {rival[0]}, {entry[1]}"] = {k: words[v] for k, v in told.items()}
     return pd.DataFrame(table).T.fillna("")

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from dmsrd_lite.demonstrations import check_folder
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.workbook.lessons import NOTEBOOKS, lessons
 from dmsrd_lite.workbook.records import ROOT
@@ -26,10 +27,8 @@ def make_book(executed: Path, output: Path) -> Path:
     """Write the pages into ``output``; returns the first one, ``index.html``.
 
     ``executed``: a folder with a copy of every lesson, as ``make workbook`` leaves it; exercises are shown
-    without answers. ``InputError`` where a copy is missing, or ended in an error.
+    without answers. ``InputError`` where a copy is missing, does not open or ended in an error.
     """
-    import nbformat
-
     missing = [path.stem for path in lessons() if not (executed / path.name).exists()]
     if missing:
         what = f"{executed}: expected an executed copy of every lesson"
@@ -39,7 +38,7 @@ def make_book(executed: Path, output: Path) -> Path:
     sources |= TEXTS | {path.stem: path.relative_to(ROOT).as_posix() for path in lessons()}
     pages = {source: f"{page}.html" for page, source in sources.items()}
     pages["notebooks/exercises"] = pages[exercises[0].relative_to(ROOT).as_posix()]
-    output.mkdir(parents=True, exist_ok=True)
+    check_folder(output / "any")
     order = ["index", *(path.stem for path in lessons()), *(f"exercise_{path.stem}" for path in exercises)]
     order += [page for page in TEXTS if page not in order]
     titles, bodies = {}, {}
@@ -50,14 +49,25 @@ def make_book(executed: Path, output: Path) -> Path:
             text = source.read_text()
             body = _markdown(text, source.parent, link)
         else:
-            notebook = nbformat.read(executed / source.name if page == source.stem else source, 4)
-            text = notebook.cells[0].source
+            notebook, text = _read(executed / source.name if page == source.stem else source)
             body = _notebook(notebook, source.parent, link)
         (titles[page],) = re.findall(r"^# (.+)$", text, re.MULTILINE)[:1] or [page]
         bodies[page] = body
     for before, page, after in zip(["", *order], order, [*order[1:], ""], strict=False):
         (output / f"{page}.html").write_text(_page(titles, bodies[page], before, page, after))
     return output / "index.html"
+
+
+def _read(path: Path) -> tuple[Any, str]:
+    """A notebook, and the text of its first cell."""
+    import nbformat
+
+    try:
+        notebook = nbformat.read(path, 4)
+        return notebook, notebook.cells[0].source
+    except Exception as error:
+        text = f"{path}: does not open as a notebook ({type(error).__name__}); expected an executed lesson"
+        raise InputError(text) from None
 
 
 def _page_of(pages: dict[str, str], folder: str, url: str) -> str:

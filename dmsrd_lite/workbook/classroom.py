@@ -6,6 +6,7 @@ as well.
 
 import logging
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -17,13 +18,20 @@ from typing import Any, NamedTuple
 
 import nbformat
 import pandas as pd
+from nbformat.warnings import DuplicateCellId
 
+from dmsrd_lite.demonstrations import check_folder
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.workbook.lessons import NOTEBOOKS
 from dmsrd_lite.workbook.records import ROOT
 
 SOLUTIONS = NOTEBOOKS / "exercises" / "solutions"
 SETTINGS = SOLUTIONS.parent / "nbgrader_config.py"
+REASONS = {  # a word of nbgrader's log: why a notebook could not be graded
+    "DeadKernelError": "its code ended Python (exit, or out of memory)",
+    "CellTimeoutError|unresponsive": "a loop in it neither ends nor can be interrupted; grade it by hand",
+    "": "nbgrader cannot take it; `nbgrader autograde {lesson} --student={student}` in the course says why",
+}
 
 
 class Submission(NamedTuple):
@@ -51,7 +59,7 @@ def release(course: str | Path, lessons: Sequence[str] = ()) -> list[Path]:
         raise InputError(
             f"{course} is not empty and not a course; expected a new folder, or one made by release"
         )
-    course.mkdir(parents=True, exist_ok=True)
+    check_folder(settings)
     if not settings.exists():
         shutil.copyfile(SETTINGS, settings)
     written = []
@@ -78,24 +86,26 @@ def find_submissions(folder: str | Path) -> tuple[list[Submission], list[dict[st
     """Notebooks under ``folder`` by student and lesson, and a note for each that cannot be taken.
 
     A notebook has its lesson's name; the student's is that of its folder (above a folder of the lesson's
-    name, as nbgrader lays them).
+    name, as nbgrader lays them). A folder that holds none is a student's, too, and gets a note.
     """
     folder = Path(folder).resolve()
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder; expected one with STUDENT/LESSON.ipynb for each student")
     hidden = (".", "__MACOSX")  # checkpoints, and what archives of other systems hold
-    paths = [
+    inside = [
         path
-        for path in sorted(folder.rglob("*.ipynb"))
+        for path in sorted(folder.rglob("*"))
         if not any(part.startswith(hidden) for part in path.relative_to(folder).parts)
     ]
+    paths = [path for path in inside if path.suffix == ".ipynb"]
     if not paths:
         raise InputError(f"{folder}: no notebook in it; expected STUDENT/LESSON.ipynb for each student")
-    known, taken, notes = lessons_with_exercise(), defaultdict(list), []
+    known, taken, notes, homes = lessons_with_exercise(), defaultdict(list), [], set()
     for path in paths:
         home, lesson = path.parent, path.stem
         home = home.parent if home.name in known and home != folder else home
         student = home.name if home != folder else "?"
+        homes |= {path.parent if student == "?" else home} - {folder}
         if lesson not in known:
             text = f"{path.name} is no exercise; expected the name of the copy that was handed out"
             notes.append({"student": student, "lesson": "", "note": text})
@@ -104,6 +114,13 @@ def find_submissions(folder: str | Path) -> tuple[list[Submission], list[dict[st
             notes.append({"student": student, "lesson": lesson, "note": text})
         else:
             taken[student, lesson].append(path)
+    for place in filter(Path.is_dir, inside):
+        if not any(place.is_relative_to(home) or home.is_relative_to(place) for home in homes):
+            homes.add(place)
+            files = [str(path.relative_to(place)) for path in sorted(place.rglob("*")) if path.is_file()]
+            what = ", ".join(files[:3] + ["..."] * (len(files) > 3)) or "nothing"
+            text = f"no notebook in its folder, but {what}; expected LESSON.ipynb"
+            notes.append({"student": place.name, "lesson": "", "note": text})
     found = []
     for (student, lesson), several in taken.items():
         if len(several) > 1:
@@ -117,10 +134,7 @@ def find_submissions(folder: str | Path) -> tuple[list[Submission], list[dict[st
 
 def inspect(path: Path, handed_out: Path) -> tuple[str, bool]:
     """What is unusual about a submitted notebook, in words ("" for nothing), and whether it can be graded."""
-    try:
-        notebook = nbformat.read(path, 4)
-    except Exception as error:
-        return f"does not open as a notebook ({type(error).__name__})", False
+    notebook, warned = _read(path)
     cells = [name for name in map(task_of, notebook.cells) if name]
     tasks = {task_of(cell) for cell in nbformat.read(handed_out, 4).cells} - {"setup", "open"}
     if not tasks & set(cells):
@@ -128,10 +142,20 @@ def inspect(path: Path, handed_out: Path) -> tuple[str, bool]:
     notes = []
     if doubles := sorted({name for name in cells if cells.count(name) > 1}):
         notes.append(f"the cell {', '.join(doubles)} is there more than once; all ran, the last one counts")
+    if DuplicateCellId in warned:
+        notes.append("some cells have the same id; graded with new ones")
     kernel = notebook.metadata.get("kernelspec", {}).get("name", "none")
     if kernel != "python3":
         notes.append(f"asks for the kernel {kernel}; graded with python3")
     return "; ".join(notes), True
+
+
+def _read(path: Path) -> tuple[nbformat.NotebookNode, set[type[Warning]]]:
+    """A notebook, and the kinds of what it was warned of (and mended) while it was read."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        notebook = nbformat.read(path, 4)
+    return notebook, {warning.category for warning in caught}
 
 
 def task_of(cell: nbformat.NotebookNode) -> str | None:
@@ -141,17 +165,20 @@ def task_of(cell: nbformat.NotebookNode) -> str | None:
 def mended(path: Path, handed_out: Path) -> tuple[nbformat.NotebookNode, list[str]]:
     """A submission as it can be graded, and the names of the cells that were missing.
 
-    Each task's cell is the first of its name; what is there again is plain code. A check that is missing, or
-    the first cell's imports, is put back before the next task. An answer is not: a stub might hide what
-    stands in another cell.
+    Each task's cell is the first of its name; what is there again is plain code. What nbgrader knows of a
+    cell is what was handed out. A check that is missing, or the first cell's imports, is put back before the
+    next task. An answer is not: a stub might hide what stands in another cell.
     """
-    notebook, seen, gone = nbformat.read(path, 4), set(), []
+    (notebook, _), whole, gone = _read(path), nbformat.read(handed_out, 4), []
+    notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3"}
+    about = {task_of(cell): cell.metadata["nbgrader"] for cell in whole.cells if task_of(cell)}
     for cell in notebook.cells:
-        if (name := task_of(cell)) in seen:
-            del cell.metadata["nbgrader"]
-        seen |= {name} - {None}
+        own = about.pop(task_of(cell), None)
+        cell.metadata.pop("nbgrader", None)
+        if own:
+            cell.metadata["nbgrader"] = own
     place = len(notebook.cells)
-    for cell in reversed(nbformat.read(handed_out, 4).cells):
+    for cell in reversed(whole.cells):
         names = [task_of(one) for one in notebook.cells]
         if (name := task_of(cell)) in names:
             place = names.index(name) if name else place
@@ -179,20 +206,24 @@ def grade(course: str | Path, submissions: str | Path, progress: Callable = iter
         handed_out = course / "release" / lesson / f"{lesson}.ipynb"
         text, gradable = "was not released in this course", False
         if handed_out.exists():
-            text, gradable = inspect(path, handed_out)
+            try:
+                text, gradable = inspect(path, handed_out)
+                notebook, gone = mended(path, handed_out)
+                content = nbformat.writes(notebook).encode()
+            except Exception as error:  # one odd notebook must not end the others' grading
+                text, gradable = f"does not open as a notebook ({type(error).__name__})", False
         if gradable:
             place = course / "submitted" / student / lesson
-            notebook, gone = mended(path, handed_out)
             if gone:
                 text = f"{text}; " * bool(text) + f"missing: {', '.join(gone)}"
             shutil.rmtree(place, ignore_errors=True)
             place.mkdir(parents=True)
-            nbformat.write(notebook, place / f"{lesson}.ipynb")
+            (place / f"{lesson}.ipynb").write_bytes(content)
             answer = api.autograde(lesson, student)
             if answer["success"]:
                 api.generate_feedback(lesson, student)
             else:
-                text, gradable = _why(answer), False
+                text, gradable = _why(answer).format(lesson=lesson, student=student), False
                 with api.gradebook as book:  # no points rather than none
                     book.remove_submission(lesson, student)
         elif _has(api, lesson, student):
@@ -249,8 +280,14 @@ def _graded(book: Any) -> Iterator[tuple[Any, Any, list]]:
 
 def _notes(course: Path) -> list[dict[str, str]]:
     """What was noticed so far: ``notes.csv``, one line each."""
-    path = course / "notes.csv"
-    return pd.read_csv(path, dtype=str, keep_default_na=False).to_dict("records") if path.exists() else []
+    path, columns = course / "notes.csv", ["student", "lesson", "note"]
+    try:
+        return pd.read_csv(path, dtype=str, keep_default_na=False)[columns].to_dict("records")
+    except (FileNotFoundError, pd.errors.EmptyDataError):
+        return []
+    except (KeyError, ValueError, OSError) as error:
+        text = f"{path}: no table of notes ({type(error).__name__}); expected the columns"
+        raise InputError(f"{text} {', '.join(columns)}, or no such file") from None
 
 
 def _course(course: str | Path) -> Path:
@@ -262,6 +299,7 @@ def _course(course: str | Path) -> Path:
 
 def _nbgrader(course: Path) -> Any:
     from nbgrader.apps import NbGraderAPI
+    from sqlalchemy.exc import DatabaseError
     from traitlets.config import PyFileConfigLoader
 
     tools = str(Path(sys.executable).parent)  # nbgrader calls alembic by its bare name
@@ -272,7 +310,13 @@ def _nbgrader(course: Path) -> Any:
     config.NbGraderAPI.log_level = logging.ERROR
     logging.getLogger("traitlets").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="nbgrader")  # of its database
-    return NbGraderAPI(config=config)
+    api = NbGraderAPI(config=config)
+    try:
+        api.gradebook.close()
+    except DatabaseError as error:
+        path = course / "gradebook.db"
+        raise InputError(f"{path}: does not open ({error.orig}); expected nbgrader's, or no file") from None
+    return api
 
 
 def _has(api: Any, lesson: str, student: str) -> bool:
@@ -283,8 +327,8 @@ def _has(api: Any, lesson: str, student: str) -> bool:
 
 def _why(answer: dict[str, Any]) -> str:
     """Why a notebook could not be graded, in words where they are known."""
-    dead = "DeadKernelError" in f"{answer.get('log')} {answer.get('error')}"
-    return "its code ended Python (exit, or out of memory)" if dead else _last_line(answer)
+    said = f"{answer.get('log')} {answer.get('error')}"
+    return next(text for word, text in REASONS.items() if re.search(word, said))
 
 
 def _expect(answer: dict[str, Any], text: str) -> None:

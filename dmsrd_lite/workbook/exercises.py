@@ -1,24 +1,29 @@
-"""What the exercises check answers with: a wrong answer gets a hint that names the mistake."""
+"""What the exercises check answers with: a wrong answer gets a hint that names the mistake.
 
+In a notebook, importing this also changes how errors are shown: see ``_show``.
+"""
+
+import linecache
+import sys
 from collections.abc import Mapping
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 
 
 class Wrong(AssertionError):
-    """A wrong answer; in a notebook its sentence alone is shown."""
-
-    def _render_traceback_(self) -> list[str]:
-        return [f"AssertionError: {self}"]
+    """A wrong answer."""
 
 
 def check(found: Any, right: Any, hints: Mapping[str, Any] | None = None, tolerance: float = 1e-6) -> None:
     """Nothing where ``found`` is right; else ``AssertionError``, with the hint whose wrong answer it is.
 
     ``hints``: {hint: the answer that deserves it}. Numbers may differ by ``tolerance``, absolutely and
-    relatively; shapes may not differ. Tuples are compared part by part.
+    relatively; shapes may not differ. A tuple is compared part by part, and a list does in its place.
     """
+    if isinstance(right, tuple) and isinstance(found, list):
+        found = tuple(found)
     if same(found, right, tolerance):
         return
     for hint, wrong in (hints or {}).items():
@@ -38,7 +43,7 @@ def same(one: Any, other: Any, tolerance: float = 1e-6) -> bool:
     """Are the two equal, numbers to within ``tolerance``?"""
     if isinstance(other, tuple):
         return (
-            isinstance(one, tuple)
+            isinstance(one, (tuple, list))
             and len(one) == len(other)
             and all(same(a, b, tolerance) for a, b in zip(one, other, strict=True))
         )
@@ -69,6 +74,8 @@ def _shape(x: Any) -> str:
         return f"a tuple of {len(x)}"
     if x is None or isinstance(x, (str, bool)):
         return "nothing (is a return missing?)" if x is None else f"a {type(x).__name__}"
+    if isinstance(x, list) and any(part is None for part in x):
+        return "a list with None in it (is a return missing?)"
     if (array := _numbers(x)) is None:
         return f"a {type(x).__name__} that is no array of numbers"
     return f"an array of shape {array.shape}" if array.shape else "a number"
@@ -81,3 +88,35 @@ def _shown(x: Any, digits: int) -> str:
         return np.array2string(np.round(np.asarray(_plain(x)), digits), precision=digits)
     except TypeError:  # nothing where a number belongs
         return str(x)
+
+
+def _show(shell: Any, kind: type, error: Exception, trace: Any, tb_offset: int | None = None) -> None:
+    """Show an error in a notebook, without the lines of checks: they hold hints and right answers.
+
+    What a check says, and *not yet*, is one line. Any other error is shown from the first line on that is an
+    answer's.
+    """
+
+    def of_check(step: TracebackType) -> bool:
+        lines = linecache.getlines(step.tb_frame.f_code.co_filename)
+        return of_cell(step) and any(__name__ in line for line in lines)
+
+    def of_cell(step: TracebackType) -> bool:
+        return step.tb_frame.f_globals is shell.user_ns
+
+    while trace and (not of_cell(trace) or of_check(trace)):
+        trace = trace.tb_next
+    step = trace
+    while step:
+        while step.tb_next and of_check(step.tb_next):
+            step.tb_next = step.tb_next.tb_next
+        step = step.tb_next
+    if trace is None or isinstance(error, AssertionError) or str(error) == "not yet":
+        name = "AssertionError" if isinstance(error, AssertionError) else kind.__name__
+        shell._showtraceback(kind, error, [f"{name}: {error}"])
+    else:
+        shell.showtraceback((kind, error, trace), tb_offset=0)
+
+
+if "IPython" in sys.modules and (_shell := sys.modules["IPython"].get_ipython()):
+    _shell.set_custom_exc((Exception,), _show)

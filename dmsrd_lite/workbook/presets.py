@@ -315,6 +315,7 @@ BENCHMARK = {  # what each part trains: method, start
     "ours": [("DMSRD without BCD", "nothing"), ("DMSRD", "nothing")],
     "printed": [("DMSRD as printed", "nothing")],
     "control": [("AIRL Single", "nothing")],  # with the steps that DMSRD leaves to its AIRL
+    "control_clone": [("AIRL Single", "clone")],
 }
 
 
@@ -337,14 +338,22 @@ class BenchmarkLesson:  # 07
         return _fresh(self.domain)
 
     @property
-    def share(self) -> int:
-        """Of the main budget, what DMSRD's rounds leave to its AIRL, from nothing."""
-        return self.methods("DMSRD", "nothing", self.main).dmsrd.airl.max_steps
+    def budget_of(self) -> dict[str, int]:
+        """Of the tables, by start."""
+        return {"clone": self.from_clone, "nothing": self.main}
+
+    def share(self, start: str) -> int:
+        """Of the tables' budget, what DMSRD's rounds leave to its AIRL."""
+        return self.methods("DMSRD", start, self.budget_of[start]).dmsrd.airl.max_steps
+
+    def scored_at(self, method: str, start: str, part: str) -> tuple[int, ...]:
+        """The budgets at which a part scores a method."""
+        return self.budgets if part == "rivals" else self.trained_for(method, start, part)
 
     def trained_for(self, method: str, start: str, part: str = "") -> tuple[int, ...]:
         """The budgets that ask for a training of their own."""
-        if part == "control":
-            return (self.share,)
+        if part.startswith("control"):
+            return (self.share(start),)
         if start == "clone":
             return (self.from_clone,)
         if method.startswith("DMSRD"):
@@ -416,7 +425,17 @@ class LifelongLesson:  # 08
         absolute = replace(loop.msrd, between_class_relative=False)
         found["Equation 4 as printed"] = replace(loop, msrd=absolute)
         found["longer rounds"] = replace(loop, msrd=replace(loop.msrd, n_iterations=5))
-        return found | {"policies learn after mixtures": replace(loop, policies_after_mixture=True)}
+        found["policies learn after mixtures"] = replace(loop, policies_after_mixture=True)
+        usual = METHODS_FROM_NOTHING[self.domain].dmsrd  # ours of lesson 06, but for what bounds the work
+        rounds = replace(usual.msrd, n_iterations=loop.msrd.n_iterations)
+        found["from nothing"] = replace(
+            usual,
+            msrd=rounds,
+            remembered=loop.remembered,
+            own_rollouts=loop.own_rollouts,
+            kl_margin=loop.kl_margin,
+        )
+        return found
 
 
 def _lifelong(domain: str, quick: bool) -> LifelongLesson:

@@ -1,16 +1,19 @@
 """Three doors, the same arrays behind them; and what is refused, in a sentence."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from dmsrd_lite.__main__ import main
 from dmsrd_lite.beyond.conversion import convert
-from dmsrd_lite.demonstrations import load_demonstrations, validate_file
+from dmsrd_lite.demonstrations import load_demonstrations, load_shipped, validate_file
 from dmsrd_lite.domains import InputError, get_domain
 
 N, T = 4, 12
+PUSH = spaces.Box(-3, 3, (1,))
 SAVED = Path(__file__).parent / "trajectories"  # by `datasets`, in the form in which `imitation` saves
 
 
@@ -33,9 +36,9 @@ def plain(folder, arrays, **changes):
     return folder / "plain.npz"
 
 
-def minari(folder, arrays, monkeypatch, version=0, ended=False, length=T):
+def minari(folder, arrays, monkeypatch, version=0, ended=False, length=T, form=None, **other):
+    """``form`` (field, function): how a field is stored; ``other``: its space."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
-    from gymnasium.spaces import Box
     from minari import create_dataset_from_buffers
     from minari.data_collector import EpisodeBuffer
 
@@ -43,11 +46,12 @@ def minari(folder, arrays, monkeypatch, version=0, ended=False, length=T):
     for i in range(N):
         t = length if i == 2 else T
         over = {"terminations": [False] * (t - 1) + [ended], "truncations": [False] * (t - 1) + [not ended]}
-        states, actions = arrays["observations"][i, : t + 1], arrays["actions"][i, :t]
-        rewards = list(arrays["rewards"][i, :t])
-        episodes.append(EpisodeBuffer(observations=states, actions=actions, rewards=rewards, **over))
-    spaces = {"observation_space": Box(-np.inf, np.inf, (4,)), "action_space": Box(-3, 3, (1,))}
-    create_dataset_from_buffers(f"pole/people-v{version}", episodes, **spaces)
+        parts = {"observations": arrays["observations"][i, : t + 1], "actions": arrays["actions"][i, :t]}
+        if form:
+            parts[form[0]] = form[1](parts[form[0]])
+        episodes.append(EpisodeBuffer(**parts, rewards=list(arrays["rewards"][i, :t]), **over))
+    kinds = {"observation_space": spaces.Box(-np.inf, np.inf, (4,)), "action_space": PUSH, **other}
+    create_dataset_from_buffers(f"pole/people-v{version}", episodes, **kinds)
     return folder
 
 
@@ -79,13 +83,39 @@ def test_a_file_with_four_axes_says_who_is_who(arrays, tmp_path):
         convert(tmp_path / "plain.npz", each=4)
 
 
-def test_notes(arrays, tmp_path):
-    single = arrays["observations"].astype(np.float32)
-    _, notes = convert(plain(tmp_path, arrays, observations=single, rewards=None))
-    for text, note in zip(
-        ("single precision", "no rewards", "one trajectory per person"), notes, strict=True
+def test_notes(tmp_path):
+    """Of the shipped people nothing but a note on rewards; of what was done to them a note each."""
+    shown = load_shipped(get_domain("inverted_pendulum")).select([0, 1])
+    whole = {name: array[:, :, :51] for name, array in shown.arrays().items() if array.ndim > 2}
+    whole |= {"actions": whole["actions"][:, :, :50], "rewards": whole["rewards"][:, :, :50]}
+    whole["reset_seeds"] = shown.reset_seeds
+    pays = "rewards are kept as they are; the task here pays -|theta|"
+    assert_notes(convert(plain(tmp_path, whole)), pays)
+    states, seeds = whole["observations"], shown.reset_seeds
+    away = "its actions, replayed from its reset_seeds, lead to states"
+    degrees, late = states * [1, 57.3, 1, 57.3], states[:, :, [1, *range(1, 51)]]
+    for changes, texts in (
+        ({"reset_seeds": seeds + 1}, [away]),
+        ({"observations": late}, [away]),
+        ({"observations": degrees, "reset_seeds": None}, ["lie outside (-2.0", "episodes fail (falls)"]),
+        ({"observations": np.add(states, [5, 0, 0, 0]), "reset_seeds": None}, ["100.0% of the states lie"]),
+        ({"observations": states.astype(np.float32)}, ["observations are of single precision"]),
     ):
+        found = convert(plain(tmp_path, whole, **changes))
+        assert_notes(found, *texts, pays)
+    first = {name: array[:, 0] for name, array in whole.items()} | {"rewards": None}
+    assert_notes(convert(plain(tmp_path, first)), "there are no rewards", "one trajectory per person")
+
+
+def assert_notes(converted, *texts):
+    for text, note in zip(texts, converted[1], strict=True):
         assert text in note
+
+
+def test_without_reset_seeds_a_note_where_starts_are_matched(tmp_path):
+    lander = {"observations": np.zeros((N, T + 1, 8)), "actions": np.zeros((N, T, 2))}
+    text = "there are no reset_seeds: rollouts start elsewhere; a KL on lunar_lander"
+    assert_notes(convert(plain(tmp_path, lander), each=2), text, "no rewards")
 
 
 @pytest.mark.parametrize(
@@ -129,7 +159,9 @@ def test_what_a_dataset_may_be_refused_for(arrays, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="episode 0: ended early, after 12 steps; expected"):
         convert(early)
     assert convert(early, steps=11)[0].horizon == 11
-    with pytest.raises(InputError, match="episode 2: has 9 states, the first has 13; expected equally long"):
+    with pytest.raises(
+        InputError, match="2: has 9 states and 8 actions, the first has 13 and 12; expected equally"
+    ):
         convert(minari(tmp_path / "short", arrays, monkeypatch, length=8))
     two = minari(tmp_path / "early", arrays, monkeypatch, version=1)
     with pytest.raises(
@@ -139,12 +171,52 @@ def test_what_a_dataset_may_be_refused_for(arrays, tmp_path, monkeypatch):
     assert convert(two / "pole" / "people-v1")[0].n_demonstrations == N
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # a test's dataset names no author
+@pytest.mark.parametrize("domain", [None, get_domain("inverted_pendulum")])
+@pytest.mark.parametrize(
+    ("field", "form", "space", "sentence"),
+    [
+        ("actions", lambda a: {"push": a}, spaces.Dict(push=PUSH), "actions come as a dict; expected one"),
+        ("actions", lambda a: (a,), spaces.Tuple([PUSH]), "actions come as a tuple; expected one vector"),
+        ("observations", lambda s: ["up"] * len(s), spaces.Text(2), "observations come as a list; expected"),
+        ("observations", lambda s: {"pole": s}, spaces.Dict(pole=spaces.Box(-9, 9, (4,))), "come as a dict;"),
+        ("observations", lambda s: [0] * len(s), spaces.Discrete(2), "has observations of shape (13,)"),
+        ("actions", lambda a: [0] * len(a), spaces.Discrete(2), "has actions of shape (12,)"),
+    ],
+)  # fmt: skip
+def test_a_dataset_of_other_things_than_vectors(
+    field, form, space, sentence, domain, arrays, tmp_path, monkeypatch
+):
+    stored = {"form": (field, form), f"{field[:-1]}_space": space}
+    with pytest.raises(InputError) as error:
+        convert(minari(tmp_path, arrays, monkeypatch, **stored), domain)
+    assert sentence in str(error.value)
+
+
+@pytest.mark.parametrize("n_acts", [(T, T + 1), (T + 1, T)])
+def test_as_many_states_as_the_first_but_not_as_many_actions(n_acts, arrays, tmp_path):
+    import pyarrow
+
+    states = arrays["observations"][:2]
+    acts = [np.zeros((n, 1)).tolist() for n in n_acts]
+    table = pyarrow.table({"obs": states.tolist(), "acts": acts})
+    with pyarrow.ipc.new_stream(tmp_path / "data.arrow", table.schema) as stream:
+        stream.write_table(table)
+    (tmp_path / "state.json").write_text('{"_data_files": [{"filename": "data.arrow"}]}')
+    sentence = f"episode 1: has 13 states and {n_acts[1]} actions, the first has 13 and {n_acts[0]}; expected"
+    with pytest.raises(InputError, match=sentence):
+        convert(tmp_path)
+    assert convert(tmp_path, steps=12)[0].horizon == 12
+
+
 @pytest.mark.parametrize("target", ["mine.safetensors", "plain.npz"])
 def test_a_file_of_another_kind_or_the_source_itself_is_not_written(target, arrays, tmp_path, capsys):
     source = plain(tmp_path, arrays)
     before = source.read_bytes()
     assert main(["convert", str(source), str(tmp_path / target)]) == 2
-    assert "expected another file, with the ending .npz" in capsys.readouterr().err
+    assert re.search(
+        "expected (a name with the ending .npz|another file to be written)", capsys.readouterr().err
+    )
     assert source.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["plain.npz"]
 

@@ -285,6 +285,10 @@ BAD = {
         r"a demonstration with observations of shape \(1, 51, 4\) arrived; expected \(2, 51, 4\)"),
     "last successor unknown": (lambda d: replace(d, actions=d.actions[:, :, [*range(50), 49]]),
         r"a demonstration with actions of shape \(2, 51, 1\) arrived; expected \(2, 50, 1\) .* as before"),
+    "no number": (lambda d: replace(d, actions=np.where(d.actions > 0, np.nan, d.actions)),
+        "demonstration 2 cannot be learned from: actions: holds NaN or infinity, first at index"),
+    "out of bounds": (lambda d: replace(d, actions=d.actions + 10), "demonstration 2 cannot be learned "),
+    "two at once": (lambda d: d.select([0, 0]), "2 demonstrations arrived together; expected one"),
 }  # fmt: skip
 
 
@@ -293,7 +297,7 @@ def test_a_bad_demonstration_is_refused_in_one_sentence(fault, three, states):
     spoil, sentence = BAD[fault]
     bare = replace(three.select([2]), rewards=None, reset_seeds=None)
     with pytest.raises(InputError, match=f"^{sentence}[^\n]*$"):
-        after(states[2], spoil(bare))
+        dmsrd.learn_one(states[2], spoil(bare), ROUGH)
 
 
 def test_optional_fields_may_be_missing(three, states):

@@ -1,6 +1,5 @@
 """Lesson 07's table: made of whole benchmarks only, and verdicts by hand."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -75,12 +74,18 @@ def test_what_frozen_rewards_teach():
 
 
 def test_a_budget_that_no_record_holds():
-    with pytest.raises(InputError, match=r"^DMSRD from nothing was not scored at 100,000 steps per demonstr"):
+    with pytest.raises(
+        InputError, match=r"scored at 100,000 steps per demonstration in trial 0, 1; expected"
+    ):
         everything().per_trial("DMSRD", "nothing", 100_000)
     with pytest.raises(
         InputError, match=r"expected one of the budgets that the records hold: nothing of it$"
     ):
         everything().per_trial("cloning", "clone", 0)
+    found = everything()
+    del found.rows[1, "DMSRD", "nothing", 250_000]
+    with pytest.raises(InputError, match=r"at 250,000 .* in trial 1; expected .*: 500,000$"):
+        found.per_trial("DMSRD", "nothing", 250_000)
 
 
 def test_parts_of_different_runs_are_refused():
@@ -88,10 +93,17 @@ def test_parts_of_different_runs_are_refused():
         everything(arrival=(1, 0))
 
 
-def save(folder, part, k, settings=LESSON):
-    parameters = {"domain": "inverted_pendulum", "preset": "full", "seed": k}
+def save(folder, part, k, settings=LESSON, **said):
+    parameters = {"domain": "inverted_pendulum", "preset": "full", "seed": k, "part": part} | said
+    rows = {
+        f"{method}, {start}": {
+            str(b): row([-1.0, -1.0], worth={}) for b in LESSON.scored_at(method, start, part)
+        }
+        for method, start in presets.BENCHMARK[part]
+    }
     name = benchmark.record_name("inverted_pendulum", part, k)
-    save_record(name, parameters, settings, trial((-1.0, -1.0), method=part), {}, folder)
+    known = KNOWN | {"arrival": [0, 1]}
+    save_record(name, parameters, settings, {"known": known, "scores": rows}, {}, folder)
     return folder / f"{name}.json"
 
 
@@ -99,23 +111,47 @@ def test_records_are_read_whole_or_not_at_all(tmp_path):
     files = [save(tmp_path, part, k) for part in presets.BENCHMARK for k in benchmark.TRIALS]
     found = benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
     assert sorted(found.known) == list(benchmark.TRIALS)
-    assert len(found.rows) == 2 * len(files)
-    other = dataclasses.replace(LESSON, main=250_000)
-    with pytest.raises(
-        InputError, match=r"clone_seed0 was made with other settings than this lesson's; expec"
-    ):
-        benchmark.load(INVERTED_PENDULUM, other, tmp_path)
-    name = benchmark.record_name("inverted_pendulum", "rivals", 0)
-    scores = {"known": trial((0, 0))["known"], "scores": {"MSRD, nothing": {"500000": row([0.0, 0.0])}}}
-    save_record(name, {}, LESSON, scores, {}, tmp_path)
-    with pytest.raises(InputError, match=r"rivals_seed0 does not say what the task reward of MSRD, nothing"):
-        benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
-    save(tmp_path, "rivals", 0)
-    assert json.loads(files[-1].read_text())["parameters"]["seed"] == 2
+    assert len(found.rows) == 3 * (7 + 3 * 4 + 2 + 3 + 1 + 1)
     files[-1].unlink()
     with pytest.raises(
-        InputError, match=r"control_seed2 is missing; expected all trials: run papermill_runs/"
+        InputError, match=r"control_clone_seed2 is missing; expected all trials: run papermill_runs/"
     ):
+        benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
+
+
+def no_worth(record):
+    del record["results"]["scores"]["MSRD, nothing"]["500000"]["worth"]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (no_worth, "does not say what the task reward of MSRD, nothing teaches"),
+        (
+            lambda r: r["results"]["scores"].pop("MSRD, nothing"),
+            "does not hold MSRD from nothing at 100,000 st",
+        ),
+        (
+            lambda r: r["results"]["scores"]["AIRL Single, nothing"].pop("250000"),
+            "does not hold AIRL Single f",
+        ),
+        (lambda r: r["settings"].update(main=1), "was made with other settings than this lesson's; expected"),
+        (
+            lambda r: r["versions"].update(torch="1.0"),
+            "was made with torch 1.0, another with 2.13.0; expected",
+        ),
+        (lambda r: r["parameters"].update(seed=2), r"says that it is of .*2}; expected what its name says"),
+    ],
+)
+def test_mixed_records_are_refused(tmp_path, change, sentence):
+    for part in presets.BENCHMARK:
+        for k in benchmark.TRIALS:
+            save(tmp_path, part, k)
+    path = tmp_path / "07_benchmark_inverted_pendulum_rivals_seed1.json"
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+    with pytest.raises(InputError, match=f"^record 07_benchmark_inverted_pendulum_rivals_seed1 {sentence}"):
         benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
 
 
@@ -209,20 +245,57 @@ def test_a_verdict_over_the_budget():
 
 def test_the_control_has_the_steps_of_dmsrds_airl():
     """20 episodes of 1000 steps a round and strategy, and 5 of every explanation, are paid from 500,000."""
-    assert LESSON.share == 500_000 - (20 * 54 + 5 * 55) * 100
-    assert LESSON.trained_for("AIRL Single", "nothing", "control") == (LESSON.share,)
+    share = LESSON.share("nothing")
+    assert share == 500_000 - (20 * 54 + 5 * 55) * 100
+    assert LESSON.trained_for("AIRL Single", "nothing", "control") == (share,)
     trials = [(k, trial((-3.0 - k, -2.0))) for k in (0, 1)]
     for k in (0, 1):
-        scores = {str(LESSON.share): row([-9.0, -7.0]), "500000": row([-2.0, -1.0])}
+        scores = {str(share): row([-9.0, -7.0]), "500000": row([-2.0, -1.0])}
         known = trials[k][1]["known"]
         trials.append((k, {"known": known, "scores": {"AIRL Single, nothing": scores}}))
-    table = benchmark.equal_steps(benchmark.collect(INVERTED_PENDULUM, iter(trials)), LESSON.share, 500_000)
-    assert table.loc["return"].tolist()[:3] == ["-8.00", "-2.75", "-1.50"]
-    assert table.loc["return", "difference"].startswith("+5.25 [")
+    found = benchmark.collect(INVERTED_PENDULUM, iter(trials))
+    table = benchmark.equal_steps(found, LESSON)
+    line = table.loc["return, nothing (0.36 M)"]
+    assert line.tolist()[:3] == ["-8.00", "-2.75", "-1.50"]
+    assert line["difference"].startswith("+5.25 [")
     assert table["better"].tolist() == ["holds", "a tie", "a tie"]
+    told = benchmark.lost(found, benchmark.entries(found, LESSON), LESSON)
+    assert told.loc["DMSRD, nothing"].tolist() == ["AIRL Single", "return", "the missing steps are enough"]
     alone = benchmark.collect(INVERTED_PENDULUM, iter([trials[-1]]))
     del alone.rows[1, "AIRL Single", "nothing", 500_000]
-    assert benchmark.entries(alone, LESSON) == [("AIRL Single", "nothing", LESSON.share)]
+    assert benchmark.entries(alone, LESSON) == [("AIRL Single", "nothing", share)]
+    assert benchmark.equal_steps(alone, LESSON).empty
+
+
+def test_why_a_row_is_lost():
+    """AIRL Single loses its return to MSRD as DMSRD does, but not its KL; without BCD R_Task is as weak."""
+    trials = [(k, trial((-5.0, -5.0))) for k in (0, 1)]
+    for _, one in trials:
+        rows = one["scores"]
+        rows["DMSRD, nothing"]["500000"]["divergence"] = [3.0, 4.0]
+        rows["DMSRD without BCD, nothing"] = {"500000": row([-5.0, -5.0])}
+        rows["AIRL Single, nothing"] = {"500000": row([-5.0, -5.0], divergence=[3.0, 2.0])}
+        rows["MSRD, nothing"] = {"500000": row([-1.0, -2.0], pearson=0.95)}
+    found = benchmark.collect(INVERTED_PENDULUM, iter(trials))
+    told = benchmark.lost(found, benchmark.entries(found, LESSON), LESSON)
+    assert told.values.tolist() == [
+        ["MSRD", "return", "AIRL: AIRL Single loses it, too"],
+        ["MSRD", "KL", "not known"],
+        ["MSRD", "Pearson of R_Task", "not BCD: without it, too"],
+    ]
+
+
+def test_ranks_are_of_people():
+    """Two trials of the same two people are two rows, or four as in the paper."""
+    trials = [(k, trial((-3.0 - k, -2.0))) for k in (0, 1)]
+    for _, one in trials:
+        for k, method in enumerate(("AIRL Single", "MSRD")):
+            one["scores"][f"{method}, nothing"] = {"500000": row([-9.0 + k, -8.0 + k])}
+    found = benchmark.collect(INVERTED_PENDULUM, iter(trials))
+    three = [(m, "nothing", 500_000) for m in ("AIRL Single", "MSRD", "DMSRD")]
+    ranks = [benchmark.ranks(found, three, "environment_return", of_people) for of_people in (True, False)]
+    assert [one.n for one in ranks] == [2, 4]
+    assert ranks[0].mean_ranks.tolist() == [3, 2, 1]
 
 
 @pytest.mark.parametrize("domain", ["inverted_pendulum", "lunar_lander"])

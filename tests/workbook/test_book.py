@@ -60,7 +60,7 @@ def test_a_figure_is_told_by_the_text_that_reads_it_and_progress_is_left_out(pag
     assert "a progress bar" not in pages["02_airl.html"]
 
 
-def test_a_lesson_that_is_missing_or_failed_is_said_in_a_sentence(executed, tmp_path):
+def test_what_cannot_become_a_book_is_said_in_a_sentence(executed, tmp_path):
     with pytest.raises(
         InputError, match=r"^.*expected an executed copy of every lesson, not found: 00_start"
     ):
@@ -71,3 +71,9 @@ def test_a_lesson_that_is_missing_or_failed_is_said_in_a_sentence(executed, tmp_
     nbformat.write(notebook, folder / "00_start_here.ipynb")
     with pytest.raises(InputError, match="00 Start here: ended in an error, no"):
         book.make_book(folder, tmp_path / "book")
+    for broken in ("{", "{}"):
+        (folder / "00_start_here.ipynb").write_text(broken)
+        with pytest.raises(InputError, match=r"^\S+/00_start_here.ipynb: does not open as a notebook"):
+            book.make_book(folder, tmp_path / "book")
+    with pytest.raises(InputError, match=r"cannot be written to \(File exists\)"):
+        book.make_book(executed, folder / "00_start_here.ipynb")
