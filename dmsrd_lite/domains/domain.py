@@ -163,5 +163,8 @@ def check_whole(value: object, name: str, least: int = 0) -> int:
 
 
 def extend(seed: Seed, *more: int) -> list[int]:
-    """A seed of its own for a part of the work: ``[*seed, *more]``."""
+    """A seed of its own for a part of the work: ``[*seed, *more]``.
+
+    Not with 0 at the end of a short one: NumPy draws the same from ``[5]`` and ``[5, 0]``.
+    """
     return [*np.atleast_1d(seed).tolist(), *more]

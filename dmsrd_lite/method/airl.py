@@ -79,6 +79,8 @@ class AIRLSettings:
         for name, least in (("policy_average", 0.0), ("last_rate", 0.0), ("iterates_share", 1e-9)):
             if not least <= getattr(self, name) <= 1:
                 raise InputError(f"{name} {getattr(self, name)!r}: expected a share of at most 1")
+        if not 0 <= self.discount < 1:
+            raise InputError(f"discount {self.discount!r}: expected a number of at least 0 and below 1")
         if self.max_steps < 0:
             raise InputError(f"max_steps {self.max_steps!r}: expected a number of steps, or 0 for no limit")
         if not self.penalty_slope > 0:

@@ -4,17 +4,18 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from dmsrd_lite.demonstrations import DemonstrationSet, plain
 from dmsrd_lite.domains import InputError
+from dmsrd_lite.learning.networks import Actor
 from dmsrd_lite.method.airl import AIRL, AIRLSettings
 from dmsrd_lite.method.divergence import policy_divergences, steps_measured
 from dmsrd_lite.method.kl_threshold import calibrate_threshold
 from dmsrd_lite.method.msrd import MSRDSettings
-from dmsrd_lite.method.policy_mixture import MixtureSettings, search_mixture
+from dmsrd_lite.method.policy_mixture import MixtureSettings, action_loss, likeliest_weights, search_mixture
 from dmsrd_lite.method.rewards import Rewards
 from dmsrd_lite.method.rounds import play_round
 from dmsrd_lite.method.state import State
@@ -24,7 +25,7 @@ MIXTURE, BETTER_MIXTURE, NEW_STRATEGY = "mixture", "mixture, better than a new s
 AS_PRINTED: dict[str, Any] = {
     "add_task_reward": False, "task_learns": False, "between_class": "mixtures", "own_rollouts": 0,
     "own_clones": False, "search_again": False, "policies_after_new": True, "policies_after_mixture": True,
-    "from_actions": False,
+    "from_actions": False, "likelihood_margin": 0.0, "between_class_relative": False,
 }  # fmt: skip
 
 
@@ -39,6 +40,8 @@ class DMSRDSettings:
 
     kl_threshold: float = 0.0  # eps: a mixture is accepted below it (nats); 0: a reference + kl_margin
     kl_margin: float = 0.5  # nats above the reference (``kl_threshold.reference_divergence``)
+    likelihood_margin: float = 0.0  # > 0: lines 5 and 11 ask the actions, not the KL: is their loss under the
+    # likeliest mixture less than so many nats above that of their own clone (``action_loss``)?
     add_task_reward: bool = True  # AIRL trains alpha g beside the frozen R_Task (the paper: alone)
     task_learns: bool = False  # R_Task learns beside a new strategy, goes 1/M of the way (the paper: rests)
     between_class: str = "always"  # Equation 4 after every branch, after "mixtures" only (the paper), "never"
@@ -60,6 +63,14 @@ class DMSRDSettings:
             raise InputError(f"kl_threshold {self.kl_threshold!r}: {expected}")
         if self.between_class not in (words := ("always", "mixtures", "never")):
             raise InputError(f"between_class {self.between_class!r}: expected one of {', '.join(words)}")
+        if not 0 <= self.likelihood_margin < np.inf:
+            expected = "expected a positive number of nats, or 0: KL decides"
+            raise InputError(f"likelihood_margin {self.likelihood_margin!r}: {expected}")
+        if self.likelihood_margin and not (self.mixture.from_actions and self.airl.start == "clone"):
+            text = "expected mixtures from_actions and policies that start from a clone"
+            raise InputError(f"likelihood_margin {self.likelihood_margin!r}: {text}, or 0")
+        if not self.msrd.alpha > 0:
+            raise InputError(f"alpha {self.msrd.alpha!r}: expected a positive weight of the strategy rewards")
         half = [one.coverage == "half" for one in (self.airl, self.msrd)]
         for name, (first, second) in {"start": (self.airl.start, self.msrd.start), "coverage": half}.items():
             if first != second:
@@ -70,7 +81,7 @@ class DMSRDSettings:
         """Algorithm 1 as the paper prints it, from the same start: every deviation taken back."""
         return replace(
             self,
-            **{name: usual for name, usual in AS_PRINTED.items() if name != "from_actions"},
+            **{name: usual for name, usual in AS_PRINTED.items() if name in vars(self)},
             remembered=0,
             msrd=replace(self.msrd, between_class_relative=False),
             mixture=replace(self.mixture, from_actions=False),
@@ -79,7 +90,7 @@ class DMSRDSettings:
     @property
     def form(self) -> str:
         """In words: the start, and what deviates from the paper."""
-        known = {**vars(self), "from_actions": self.mixture.from_actions}
+        known = vars(self) | vars(self.msrd) | {"from_actions": self.mixture.from_actions}
         names = [name for name, usual in AS_PRINTED.items() if known[name] != usual]
         start = self.airl.start + (" with coverage" if self.airl.coverage == "half" else "")
         return f"from {start}, {', '.join(names) or 'as printed'}"
@@ -93,7 +104,8 @@ def learn(state: State, demonstrations: DemonstrationSet, settings: DMSRDSetting
     from, with demonstrations that it does not know yet.
 
     record (a dict, ``state.records[-1]``): branch (``MIXTURE``, ``BETTER_MIXTURE``, ``NEW_STRATEGY``);
-    kl_mix, kl_new, threshold (eps) and reference in nats, None where it was not asked for;
+    kl_mix, kl_new, threshold (eps) and reference in nats, shortfall (``likelihood_margin``) in nats an
+    action's coordinate, None where it was not asked for;
     weights (M,); n_strategies; remembered, kl_before_round, kl_after_round, searched_again and recognized of
     the round (``play_round``); steps of the environment, by use; seconds. A kl_new far above the threshold:
     even the new strategy does not do what was shown.
@@ -113,12 +125,14 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
     eps, reference = calibrate_threshold(new, candidate, s, [*seed, 7])
     if new.domain.comparison.matched_starts and not s.kl_threshold:  # the reference was flown
         steps["search"] += steps_measured(new, s.mixture.final_rollouts)
-    kl_mix = kl_new = float("inf")
+    kl_mix = kl_new = shortfall = float("inf")
     if state.n_strategies:
         policies = state.policies().actor()
         fit = search_mixture(policies, new, s.mixture, [*seed, 1], enough=eps)  # 3: w = mixture optimisation
         kl_mix, steps["search"] = fit.divergence, steps["search"] + fit.steps  # 4: KL_mix
-    if kl_mix < eps:  # 5
+        if s.likelihood_margin:
+            shortfall = _shortfall(policies, new, candidate())
+    if shortfall < s.likelihood_margin if s.likelihood_margin else kl_mix < eps:  # 5
         branch, known = MIXTURE, state.explained(new, fit.weights)  # 6: keep w, no new strategy
     else:  # 8
         for _ in candidate().train():  # 9: train AIRL on tau_i: a policy and a strategy reward
@@ -126,14 +140,16 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
         learned, steps["airl"] = candidate().learned_policies.actor(), candidate().steps
         kl_new = float(policy_divergences(learned, new, [*seed, 2, 9])[0])  # 10: KL_new
         steps["search"] += steps_measured(new)
-        if kl_mix < kl_new:  # 11: then AIRL leaves no trace
+        better = shortfall < _shortfall(learned, new, candidate()) if s.likelihood_margin else kl_mix < kl_new
+        if better:  # 11: then AIRL leaves no trace
             branch, known = BETTER_MIXTURE, state.explained(new, fit.weights)  # 12: keep w, no new strategy
         else:  # 14
             branch = NEW_STRATEGY
             share = 1 / (state.n_strategies + 1) if s.task_learns else 0.0
             known = state.with_strategy(new, candidate().networks(), share)  # 15, 16: w = e_M+1, m_M+1 = i
     decision = {"demonstration": n, "branch": branch, "kl_mix": kl_mix, "kl_new": kl_new, "threshold": eps}
-    decision |= {"reference": reference, "weights": known.weights[n], "n_strategies": known.n_strategies}
+    decision |= {"shortfall": shortfall, "reference": reference, "weights": known.weights[n]}
+    decision["n_strategies"] = known.n_strategies
     created = branch == NEW_STRATEGY
     known, seen, played = play_round(known, created, eps, s, seed)  # 7, 13, 17: MSRD and BCD for all
     spent = {**steps, **played, "search": steps["search"] + played["search"]}
@@ -149,6 +165,13 @@ def _candidate(state: State, new: DemonstrationSet, settings: DMSRDSettings, see
     return AIRL(new, s.airl, seed, shared=shared, task_learns=s.task_learns)
 
 
+def _shortfall(policies: Actor, new: DemonstrationSet, candidate: AIRL) -> float:
+    """By how many nats the demonstration's actions are less likely under policies, mixed as suits them best,
+    than under its own clone."""
+    own = action_loss(cast(Actor, candidate.clone), new, [1.0])
+    return action_loss(policies, new, likeliest_weights(policies, new)) - own
+
+
 def _check(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> None:
     name, known = state.domain.name, state.demonstrations
     if new.domain.name != name:
@@ -162,6 +185,9 @@ def _check(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> None
         if before != now:
             expected = f"expected {before} (trajectories, steps, dimension) as before"
             raise InputError(f"a demonstration with {array} of shape {now} arrived; {expected}")
+    if state.alpha not in (0, settings.msrd.alpha):
+        text = f"a state with alpha {state.alpha:g} cannot go on with {settings.msrd.alpha:g}"
+        raise InputError(f"{text}; expected the same weight of the strategy rewards")
     if state.form not in ("", settings.form):
         text = f"a state that was learned {state.form} cannot go on {settings.form}; expected the same form"
         raise InputError(text)

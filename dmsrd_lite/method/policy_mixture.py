@@ -57,7 +57,7 @@ class MixtureSettings:
     search_rollouts: int = 2  # per candidate, to choose the finalists
     n_finalists: int = 6
     final_rollouts: int = 10  # of the protocol (``policy_divergences``)
-    common: bool = False  # all candidates meet the same starts and the same noise (common random numbers)
+    common: bool = False  # all of a round meet the same starts and the same noise (common random numbers)
     from_actions: bool = False  # ``likeliest_weights`` first: near enough, no search (beyond the paper)
 
 
@@ -89,25 +89,37 @@ def inside_bounds(actor: Actor, demonstration: DemonstrationSet) -> tuple[np.nda
     return tuple((x / domain.half_range)[..., inside] for x in (actions, means, sigmas))
 
 
+def action_loss(actor: Actor, demonstration: DemonstrationSet, weights: ArrayLike) -> float:
+    """How unlikely one demonstrator's actions are under a mixture: ``-log N(a; w mu, (w sigma)^2)``, in nats
+    for each coordinate of an action inside its bounds (in half ranges, without ``log(2 pi) / 2``)."""
+    a, mu, sigma = (x.astype(np.float64) for x in inside_bounds(actor, demonstration))
+    return _loss(check_weights(weights, actor.n_strategies)[0], a, mu, sigma)[0]
+
+
+def _loss(w: np.ndarray, a: np.ndarray, mu: np.ndarray, sigma: np.ndarray) -> tuple[float, np.ndarray]:
+    """``action_loss`` and its gradient, (M,)."""
+    spread = w @ sigma
+    z = (a - w @ mu) / spread
+    gradient = ((sigma * (1 - z * z) - mu * z) / spread).mean(1)
+    return float(np.mean(np.log(spread) + z * z / 2)), gradient
+
+
 @one_thread()
 def likeliest_weights(actor: Actor, demonstration: DemonstrationSet) -> np.ndarray:
     """The mixture under which one demonstrator's actions are the most likely: weights (M,), without a
     rollout.
 
     ``max_w sum_t log N(a_t; sum_j w_j mu_j(s_t), (sum_j w_j sigma_j)^2)`` over the simplex. Least squares if
-    all sigmas are equal; where they are not, how widely somebody acts tells the weights as well.
+    all sigmas are equal; where they are not, how widely somebody acts tells the weights as well. Equal
+    weights where every action stands at a bound and says nothing.
     """
     a, mu, sigma = (x.astype(np.float64) for x in inside_bounds(actor, demonstration))
-
-    def loss(w: np.ndarray) -> tuple[np.floating, np.ndarray]:
-        spread = w @ sigma
-        z = (a - w @ mu) / spread
-        return np.mean(np.log(spread) + z * z / 2), ((sigma * (1 - z * z) - mu * z) / spread).mean(1)
-
     m = len(mu)
+    if not a.size:
+        return np.full(m, 1 / m)
     simplex = {"type": "eq", "fun": lambda w: w.sum() - 1, "jac": np.ones_like}
     options: dict = {"bounds": [(0, 1)] * m, "constraints": simplex, "options": {"ftol": 1e-9}}
-    found = minimize(loss, np.full(m, 1 / m), jac=True, method="SLSQP", **options)
+    found = minimize(_loss, np.full(m, 1 / m), (a, mu, sigma), jac=True, method="SLSQP", **options)
     weights = np.clip(found.x, 0, None)
     return weights / weights.sum()
 

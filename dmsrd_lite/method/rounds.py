@@ -26,20 +26,21 @@ def play_round(
     ``created``: the newest demonstration is a strategy; ``threshold``: its eps. Returns the state; for the
     record the KL of those remembered before and after, and who was searched again ({demonstration: [KL then,
     KL now]}); and the steps. Declared deviations: BCD runs after every branch (line 17 names MSRD only); a
-    mixture is searched again (the paper keeps its weights), but only where its KL has risen above its eps.
+    mixture is searched again (the paper keeps its weights), but only where its KL lies above its eps: its
+    strategies have moved away, or it was never near enough (line 11) and there is a new strategy.
     """
     s, newest, pure = settings, len(state.weights) - 1, state.pure
     some = remembered(state, s.remembered, [*seed, 6])
     thresholds = np.array([*(r["threshold"] for r in state.records), threshold])[some]
-    moving = s.policies_after_new if created else s.policies_after_mixture  # else no KL can change
+    moving = s.policies_after_new if created else s.policies_after_mixture  # else no KL changes by itself
     steps = {"search": 0, "msrd": 0, "between_class": 0}
     searched: dict[int, list[float]] = {}
 
-    def measure() -> np.ndarray:
-        n = s.measured_rollouts if moving else 0
+    def measure(asked: bool) -> np.ndarray:
+        n = s.measured_rollouts if asked else 0
         return state.divergences(some, [*seed, 3], n) if n else np.zeros(0)
 
-    before = after = measure()
+    before = after = measure(moving)
     if len(pure) > 1:
         between = None
         if s.between_class == "always" or (s.between_class == "mixtures" and not created):
@@ -53,15 +54,18 @@ def play_round(
             pass
         learner.settle()
         state, steps["msrd"] = replace(state, networks=learner.networks()), learner.steps * len(pure)
-        after, weights, policies = measure(), state.weights.copy(), state.policies().actor()
+        weights, policies = state.weights.copy(), state.policies().actor()
+        helped = created and s.search_again and len(some) > len(pure)  # by the new strategy, maybe
+        after = measure(moving or helped)
         if s.search_again:  # else nothing is decided by it
             steps["search"] += len(after) * steps_measured(state.shown, s.measured_rollouts)
-        risen = np.flatnonzero(after > thresholds[: len(after)])  # its own strategies have moved away
+        risen = np.flatnonzero(after > thresholds[: len(after)])  # never near enough, or its own moved away
         for k in risen if s.search_again else ():
             if (i := int(some[k])) not in {*pure, newest}:
                 keywords = {"incumbent": weights[i], "enough": thresholds[k]}
                 fit = search_mixture(policies, state.shown.select([i]), s.mixture, [*seed, 5, i], **keywords)
-                searched[i], steps["search"] = [after[k], fit.divergence], steps["search"] + fit.steps
+                searched[i] = [after[k], min(after[k], fit.divergence)]
+                steps["search"] += fit.steps
                 weights[i] = fit.weights if fit.divergence < after[k] else weights[i]
         state = replace(state, weights=weights)
     known = {

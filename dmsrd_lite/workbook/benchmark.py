@@ -18,7 +18,7 @@ from dmsrd_lite.evaluation.statistics import Ranks, compare_correlations, mean_i
 from dmsrd_lite.evaluation.worth import able
 from dmsrd_lite.method.dmsrd import BETTER_MIXTURE, MIXTURE
 from dmsrd_lite.workbook.presets import BENCHMARK, BenchmarkLesson
-from dmsrd_lite.workbook.records import RECORDS, load_record, settings_of
+from dmsrd_lite.workbook.records import RECORDS, load_record, same_settings
 
 # Per demonstration: what it is called in a table, and whether more is better.
 Entry = tuple[str, str, int]  # method, start, budget
@@ -161,7 +161,7 @@ def load(domain: Domain, settings: BenchmarkLesson, folder: Path = RECORDS) -> B
             said = {key: record["parameters"].get(key) for key in ("domain", "part", "seed")}
             if list(said.values()) != [domain.name, part, trial]:
                 raise InputError(f"record {name} says that it is of {said}; expected what its name says")
-            if record["settings"] != settings_of(settings):
+            if not same_settings(record["settings"], settings):
                 raise InputError(f"record {name} was made with other settings than this lesson's; {again}")
             for package, number in record["versions"].items():
                 if versions.setdefault(package, number) != number:

@@ -77,6 +77,27 @@ def settings_of(settings: Any) -> Any:
     return plain(dataclasses.asdict(settings))
 
 
+def same_settings(told: Any, settings: Any) -> bool:
+    """Was a record that says ``told`` made with these settings? What it does not know yet, because the field
+    is younger, counts as its default."""
+    if isinstance(settings, list | tuple):
+        alike = isinstance(told, list) and len(told) == len(settings)
+        return alike and all(map(same_settings, told, settings))
+    if not dataclasses.is_dataclass(settings):
+        return bool(told == plain(settings))
+    known = {field.name: field for field in dataclasses.fields(settings)}
+    return (
+        isinstance(told, dict)
+        and told.keys() <= known.keys()
+        and all(
+            same_settings(told[name], getattr(settings, name))
+            if name in told
+            else getattr(settings, name) == field.default
+            for name, field in known.items()
+        )
+    )
+
+
 def recorded(name: str, settings: Any = None) -> dict:
     """The results of a record; nothing, and one line that says so, where it is not there yet. A line, too,
     where it was made with other ``settings``."""
@@ -84,7 +105,7 @@ def recorded(name: str, settings: Any = None) -> dict:
         print(f"no record {name} yet; a run with preset=full, record=True writes it")
         return {}
     record, _ = load_record(name)
-    if settings is not None and record["settings"] != settings_of(settings):
+    if settings is not None and not same_settings(record["settings"], settings):
         print(f"record {name} was made with other settings than this lesson's: a run now may differ")
     return record["results"]
 

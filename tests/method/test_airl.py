@@ -314,6 +314,7 @@ def test_the_mean_of_iterates_is_of_functions_not_of_weights(small_set):
         ({"max_steps": -1}, "max_steps -1: expected a number of steps, or 0 for no limit"),
         ({"growth": 0.9}, "growth 0.9 from first_horizon 0: expected a growth above 1 from"),
         ({"growth": 1.0, "first_horizon": 30}, "growth 1.0 from first_horizon 30: expected a growth above 1"),
+        ({"discount": 1.0}, "discount 1.0: expected a number of at least 0 and below 1"),
         ({"policy_average": 1.5}, "policy_average 1.5: expected a share of at most 1"),
         ({"iterates_share": 0.0}, "iterates_share 0.0: expected a share of at most 1"),
     ],

@@ -4,20 +4,23 @@ import re
 from collections import Counter
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from helpers import assert_decisions_follow
+from helpers import assert_decisions_follow, balancers
 from tiny import GENEROUS, PENDULUM, ROUGH, TINY, after, assert_same, copied, everything, forbid, same, watch
 
+from dmsrd_lite.demonstrations import demonstrations_from
 from dmsrd_lite.domains import LUNAR_LANDER, InputError
+from dmsrd_lite.learning.rollouts import rollout
 from dmsrd_lite.method import airl, divergence, dmsrd, rounds
 from dmsrd_lite.method.state import State
 
 WITHOUT_COVERAGE = {name: replace(getattr(ROUGH, name), coverage="none") for name in ("airl", "msrd")}
 FIELDS = """demonstration branch kl_mix kl_new threshold reference weights n_strategies steps seconds
-remembered kl_before_round kl_after_round searched_again recognized"""
+shortfall remembered kl_before_round kl_after_round searched_again recognized"""
 
 
 def answer_with(monkeypatch, *, kl_mix=None, kl_new=None):
@@ -37,6 +40,47 @@ def test_the_loop_fits_a_screen_and_carries_the_papers_line_numbers():
     found = [[int(n) for n in numbers.split(", ")] for numbers in told]
     assert sorted(n for numbers in found for n in numbers) == list(range(3, 18))
     assert found == [*sorted(found[:-1]), [7, 13, 17]], "in the paper's order, and the rounds at the end"
+
+
+BY_ACTIONS = replace(ROUGH, likelihood_margin=0.3, mixture=replace(ROUGH.mixture, from_actions=True))
+
+
+@pytest.mark.parametrize(
+    ("kl_mix", "shortfalls", "branch"),
+    [(99.0, [0.29], "mixture"), (0.0, [0.31, 0.1], "new strategy"), (99.0, [0.31, 0.31], "new strategy"),
+     (99.0, [0.31, 0.32], "mixture, better than a new strategy")],
+)  # fmt: skip
+def test_actions_can_decide_in_place_of_the_kl(kl_mix, shortfalls, branch, three, states, monkeypatch):
+    answer_with(monkeypatch, kl_mix=kl_mix, kl_new=1.0)
+    asked, told = [], iter(shortfalls)
+    monkeypatch.setattr(dmsrd, "_shortfall", lambda actor, *_: asked.append(actor.n_strategies) or next(told))
+    state = after(replace(states[2], form=BY_ACTIONS.form), three.select([2]), BY_ACTIONS)
+    assert asked == [2, 1][: len(shortfalls)], "those known, then what AIRL made"
+    record = state.records[-1]
+    assert (record["branch"], record["shortfall"]) == (branch, shortfalls[0])
+    assert BY_ACTIONS.as_printed().likelihood_margin == 0
+    assert "likelihood_margin" in BY_ACTIONS.form
+
+
+def test_the_shortfall_is_nothing_for_who_is_among_them_and_large_for_others():
+    own = SimpleNamespace(clone=balancers([0.4]))
+    shown = demonstrations_from(rollout(PENDULUM, own.clone, 2, 1, horizon=60), own.clone)
+    assert dmsrd._shortfall(balancers([-0.4, 0.4]), shown, own) == pytest.approx(0, abs=1e-6)
+    assert dmsrd._shortfall(balancers([-0.4, 0.0]), shown, own) > 0.1
+
+
+def test_likelihoods_decide_only_from_clones_and_their_actions():
+    for change, number in (({"mixture": ROUGH.mixture}, 0.3), ({"likelihood_margin": -1.0}, -1.0)):
+        with pytest.raises(InputError, match=f"^likelihood_margin {number}: expected "):
+            replace(BY_ACTIONS, **change)
+
+
+def test_an_alpha_that_cannot_be_is_refused(three, states):
+    with pytest.raises(InputError, match=r"alpha 0.0: expected a positive weight of the strategy rewards"):
+        replace(ROUGH, msrd=replace(ROUGH.msrd, alpha=0.0))
+    other = replace(ROUGH, msrd=replace(ROUGH.msrd, alpha=3.0))
+    with pytest.raises(InputError, match=r"^a state with alpha 0.3 cannot go on with 3; expected the same"):
+        after(states[2], three.select([2]), other)
 
 
 def test_the_first_demonstration_makes_the_first_strategy(three, monkeypatch):

@@ -245,6 +245,23 @@ def test_likeliest_weights_are_told_by_sigma_where_the_means_are_equal():
     assert found[0] == pytest.approx(0.35, abs=0.05)
 
 
+def test_the_loss_of_actions_is_their_negative_log_likelihood():
+    shown, w = shown_by(Mixtures(TWO, [[0.3, 0.7]])), [0.3, 0.7]
+    a, mu, sigma = (
+        x[..., :] / 3 for x in (shown.actions[0].ravel(), TWO.mean(states_of(shown, 2)), TWO.sigma)
+    )
+    told = norm.logpdf(a, w @ mu[..., 0], w @ sigma[:, 0, 0])[np.abs(a) < 1]
+    found = policy_mixture.action_loss(TWO, shown, w)
+    assert found == pytest.approx(-told.mean() - np.log(2 * np.pi) / 2, abs=1e-5)
+    assert policy_mixture.action_loss(TWO, shown, [0.9, 0.1]) > found + 0.01
+
+
+def test_actions_that_all_stand_at_a_bound_say_nothing():
+    shown = shown_by(TWO).select([0])
+    weights = policy_mixture.likeliest_weights(TWO, replace(shown, actions=np.full_like(shown.actions, 3.0)))
+    assert weights.tolist() == [0.5, 0.5]
+
+
 def test_likeliest_weights_are_the_least_squares_where_the_sigmas_are_equal():
     """Of these weights only one direction shows: the place."""
     shown = shown_by(Mixtures(THREE, [[0.2, 0.5, 0.3]]), 200)

@@ -20,7 +20,7 @@ from dmsrd_lite.method.policy_mixture import Mixtures
 from dmsrd_lite.method.rewards import Rewards
 from dmsrd_lite.workbook import benchmark, presets
 from dmsrd_lite.workbook.lessons import lessons
-from dmsrd_lite.workbook.records import RECORDS, settings_of
+from dmsrd_lite.workbook.records import RECORDS, same_settings
 
 
 def holding(settings, key):
@@ -78,7 +78,7 @@ def test_lessons_07_and_08_draw_records_of_todays_settings():
         record, _ = stored.record_of(name)
         domain, lesson = record["parameters"]["domain"], "_".join(name.split("_")[:2])
         lesson = next(path.stem for path in lessons() if path.stem.startswith(lesson))
-        assert record["settings"] == settings_of(presets.choose(lesson, domain, "full")), name
+        assert same_settings(record["settings"], presets.choose(lesson, domain, "full")), name
 
 
 @pytest.mark.verify
@@ -111,7 +111,7 @@ def test_fresh_policies_learn_again_as_recorded(name):
     record, _, domain, seed = prepared(name)
     lesson, part = "_".join(name.split("_")[:2]), "g" if name[:2] == "02" else "task"
     fresh = presets.choose(lesson, domain.name, "full").fresh
-    assert settings_of(fresh) == record["settings"]["fresh"]
+    assert same_settings(record["settings"]["fresh"], fresh)
     for label, known in record["results"]["worth"].items():
         assert np.shape(known["curves"]) == (fresh.n_iterations, fresh.n_strategies)
         if label in record["results"]["table"]:

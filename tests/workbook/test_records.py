@@ -1,5 +1,7 @@
 """Records on disk, and the hash that says whether a number is still the number."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,20 @@ def test_round_trip_without_pickle(tmp_path):
     (tmp_path / "r.safetensors").write_bytes(b"cut")
     with pytest.raises(InputError, match=r"expected a record and its \.safetensors file"):
         load_record("r", tmp_path)
+
+
+def test_a_field_that_a_record_does_not_know_counts_as_its_default():
+    settings, same = DMSRDSettings(kl_margin=0.7), records.same_settings
+    told = records.settings_of(settings)
+    assert same(told, settings)
+    assert not same(told, DMSRDSettings())
+    assert not same(told | {"gone": 1}, settings), "what no field is called any more"
+    del told["airl"]["growth"]
+    assert same(told, settings)
+    assert not same(told, replace(settings, airl=replace(settings.airl, growth=1.1)))
+    assert not same([told], settings)
+    assert same([told, 1], (settings, 1))
+    assert not same([told], (settings, 1))
 
 
 SOURCE = '''"""A module."""
