@@ -60,7 +60,7 @@ def test_a_lesson_with_short_demonstrations_of_ones_own(tmp_path):
 
 @pytest.mark.lesson
 @pytest.mark.verify
-@pytest.mark.parametrize("domain", ["inverted_pendulum"])
+@pytest.mark.parametrize("domain", ["inverted_pendulum", "lunar_lander"])
 def test_the_benchmark_is_read_from_its_records(domain, tmp_path):
     """Nothing is trained: the tables and figures of all trials."""
     parameters = {"domain": domain, "preset": "full"}

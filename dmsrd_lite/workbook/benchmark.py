@@ -495,7 +495,7 @@ def _of_rewards(
     for number, says, rival, value in claims:
         if rival in there:
             gaps, told = _by_trials(found, entry, there[rival], value)
-            numbers = ", ".join(f"{gap:+.3f}" for gap in gaps)
+            numbers = ", ".join(f"{gap:+.{2 if number == '4' else 3}f}" for gap in gaps)
             if number == "4":
                 numbers += " ({} against {})".format(
                     *(_counted(found, e, str(most)) for e in (entry, there[rival]))

@@ -118,10 +118,12 @@ def save_record(
     tensors: dict[str, np.ndarray],
     folder: Path = RECORDS,
 ) -> Path:
-    """Write ``name.json`` (parameters, settings, versions, machine, results) and ``name.safetensors``."""
+    """Write ``name.json`` (parameters, settings, ``source_hash``, versions, machine, results) and
+    ``name.safetensors``."""
     from safetensors.numpy import save
 
-    made_with = {"settings": settings_of(settings), "versions": versions(), "machine": machine()}
+    made_with = {"settings": settings_of(settings), "source": source_hash()}
+    made_with |= {"versions": versions(), "machine": machine()}
     record = {"name": name, "parameters": parameters, **made_with, "results": results}
     text = json.dumps(plain(record), indent=1)
     one_line = r"\[\n\s+([^\[\]{}]*?)\n\s+\]"  # a list a line

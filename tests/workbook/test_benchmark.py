@@ -107,16 +107,34 @@ def save(folder, part, k, settings=LESSON, **said):
     return folder / f"{name}.json"
 
 
-def test_records_are_read_whole_or_not_at_all(tmp_path):
-    files = [save(tmp_path, part, k) for part in presets.BENCHMARK for k in benchmark.TRIALS]
-    found = benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A folder with every record of a benchmark."""
+    folder = tmp_path_factory.mktemp("records")
+    for part in presets.BENCHMARK:
+        for k in benchmark.TRIALS:
+            save(folder, part, k)
+    return folder
+
+
+@pytest.fixture
+def change(whole):
+    """Change one of them, for this test alone."""
+    path = whole / "07_benchmark_inverted_pendulum_rivals_seed1.json"
+    before = path.read_text()
+    yield lambda text: path.unlink() if text is None else path.write_text(text)
+    path.write_text(before)
+
+
+def test_records_are_read_whole_or_not_at_all(whole, change):
+    found = benchmark.load(INVERTED_PENDULUM, LESSON, whole)
     assert sorted(found.known) == list(benchmark.TRIALS)
     assert len(found.rows) == 3 * (7 + 3 * 4 + 2 + 3 + 1 + 1)
-    files[-1].unlink()
+    change(None)
     with pytest.raises(
-        InputError, match=r"control_clone_seed2 is missing; expected all trials: run papermill_runs/"
+        InputError, match=r"rivals_seed1 is missing; expected all trials: run papermill_runs/"
     ):
-        benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
+        benchmark.load(INVERTED_PENDULUM, LESSON, whole)
 
 
 def no_worth(record):
@@ -124,7 +142,7 @@ def no_worth(record):
 
 
 @pytest.mark.parametrize(
-    ("change", "sentence"),
+    ("spoil", "sentence"),
     [
         (no_worth, "does not say what the task reward of MSRD, nothing teaches"),
         (
@@ -143,16 +161,13 @@ def no_worth(record):
         (lambda r: r["parameters"].update(seed=2), r"says that it is of .*2}; expected what its name says"),
     ],
 )
-def test_mixed_records_are_refused(tmp_path, change, sentence):
-    for part in presets.BENCHMARK:
-        for k in benchmark.TRIALS:
-            save(tmp_path, part, k)
-    path = tmp_path / "07_benchmark_inverted_pendulum_rivals_seed1.json"
-    record = json.loads(path.read_text())
-    change(record)
-    path.write_text(json.dumps(record))
-    with pytest.raises(InputError, match=f"^record 07_benchmark_inverted_pendulum_rivals_seed1 {sentence}"):
-        benchmark.load(INVERTED_PENDULUM, LESSON, tmp_path)
+def test_mixed_records_are_refused(whole, change, spoil, sentence):
+    name = "07_benchmark_inverted_pendulum_rivals_seed1"
+    record = json.loads((whole / f"{name}.json").read_text())
+    spoil(record)
+    change(json.dumps(record))
+    with pytest.raises(InputError, match=f"^record {name} {sentence}"):
+        benchmark.load(INVERTED_PENDULUM, LESSON, whole)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ def test_round_trip_without_pickle(tmp_path):
     record, loaded = load_record("r", tmp_path)
     assert record["results"] == {"kl": [1.0, None], "n": 3, "table": [[1, 2], [3, 4]]}
     assert (record["parameters"], record["versions"]) == ({"seed": 0}, records.versions())
-    assert record["settings"] == records.settings_of(settings)
+    assert (record["settings"], record["source"]) == (records.settings_of(settings), source_hash())
     assert record["settings"]["airl"]["ppo"]["learning_rate"] == 1e-4, "every number that made the record"
     assert np.array_equal(loaded["a"], tensors["a"])
     assert "[1, 2]" in path.read_text(), "a list a line"
