@@ -69,8 +69,6 @@ class DMSRDSettings:
         if self.likelihood_margin and not (self.mixture.from_actions and self.airl.start == "clone"):
             text = "expected mixtures from_actions and policies that start from a clone"
             raise InputError(f"likelihood_margin {self.likelihood_margin!r}: {text}, or 0")
-        if not self.msrd.alpha > 0:
-            raise InputError(f"alpha {self.msrd.alpha!r}: expected a positive weight of the strategy rewards")
         half = [one.coverage == "half" for one in (self.airl, self.msrd)]
         for name, (first, second) in {"start": (self.airl.start, self.msrd.start), "coverage": half}.items():
             if first != second:

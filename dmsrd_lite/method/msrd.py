@@ -35,6 +35,11 @@ class MSRDSettings(AIRLSettings):
     between_class_batch: int = 128  # states of every demonstration per step
     between_class_extra: int = 10  # further updates of the strategy rewards after training (``settle``)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.alpha > 0:
+            raise InputError(f"alpha {self.alpha!r}: expected a positive weight of the strategy rewards")
+
 
 class MSRD(AIRL):
     """AIRL for labelled demonstrations, one per strategy, with a shared task reward: its gradient is the sum
@@ -55,8 +60,6 @@ class MSRD(AIRL):
         networks: dict[str, torch.Tensor] | None = None,
         between: Between | None = None,
     ):
-        if not settings.alpha > 0:
-            raise InputError(f"alpha {settings.alpha!r}: expected a positive weight of the strategy rewards")
         self.alpha, self.between = settings.alpha, None
         super().__init__(demonstrations, settings, seed, networks=networks, task_learns=True)
         if between is not None:
