@@ -79,7 +79,9 @@ def settings_of(settings: Any) -> Any:
 
 def same_settings(told: Any, settings: Any) -> bool:
     """Was a record that says ``told`` made with these settings? What it does not know yet, because the field
-    is younger, counts as its default."""
+    is younger, counts as its default; what is None in ``settings`` is not asked."""
+    if settings is None:
+        return True
     if isinstance(settings, list | tuple):
         alike = isinstance(told, list) and len(told) == len(settings)
         return alike and all(map(same_settings, told, settings))

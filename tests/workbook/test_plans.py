@@ -273,8 +273,9 @@ def test_a_stopped_driver_leaves_no_process_and_the_second_call_does_only_the_re
     printed, _ = driver.communicate(timeout=60)
     assert driver.returncode == (130 if ctrl_c else -9), printed
     assert ("stopped: finished runs are recorded, the same command" in printed) == ctrl_c
-    assert "KeyboardInterrupt" not in printed  # a kernel that ends may print a traceback of its sockets
-    assert "dmsrd_lite/workbook" not in printed
+    assert (
+        "dmsrd_lite/workbook" not in printed
+    )  # no traceback of ours; kernels say in words of their own that they end
     n_finished, before = len(records()), stamps()
     assert 3 <= n_finished < 8
     assert run() == 0

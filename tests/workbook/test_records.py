@@ -7,7 +7,7 @@ import pytest
 
 from dmsrd_lite.domains import InputError
 from dmsrd_lite.method.dmsrd import DMSRDSettings
-from dmsrd_lite.workbook import records
+from dmsrd_lite.workbook import presets, records
 from dmsrd_lite.workbook.records import DECIDING, load_record, save_record, source_hash
 
 
@@ -41,6 +41,15 @@ def test_a_field_that_a_record_does_not_know_counts_as_its_default():
     assert not same([told], settings)
     assert same([told, 1], (settings, 1))
     assert not same([told], (settings, 1))
+
+
+def test_a_record_of_one_form_outlives_a_change_of_the_other():
+    lesson = presets.choose("08_lifelong_100", "inverted_pendulum", "full")
+    told = records.settings_of(lesson.of("ours"))
+    other, own = (replace(form, kl_margin=9.0) for form in (lesson.printed, lesson.ours))
+    assert records.same_settings(told, replace(lesson, printed=other).of("ours"))
+    assert not records.same_settings(told, replace(lesson, ours=own).of("ours"))
+    assert not records.same_settings(told, lesson.of("as printed"))
 
 
 SOURCE = '''"""A module."""
