@@ -181,6 +181,15 @@ def load(domain: Domain, settings: BenchmarkLesson, folder: Path = RECORDS) -> B
     return collect(domain, results())
 
 
+def made_by(domain: Domain, folder: Path = RECORDS) -> str:
+    """In one sentence: how many states of the code made the records of a domain (their hash of it)."""
+    names = [record_name(domain.name, part, trial) for trial, part in product(TRIALS, BENCHMARK)]
+    told = [load_record(name, folder)[0].get("source") for name in names]
+    states, silent = {one for one in told if one}, told.count(None)
+    text = f"{len(told)} records; states of the code that made them: {len(states)}"
+    return f"{text}, and {silent} records tell none"
+
+
 def entries(found: Benchmark, settings: BenchmarkLesson) -> list[Entry]:
     """Who is compared in the tables: every method from each start, at the main budget of that start.
 

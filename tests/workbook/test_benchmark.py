@@ -137,6 +137,17 @@ def test_records_are_read_whole_or_not_at_all(whole, change):
         benchmark.load(INVERTED_PENDULUM, LESSON, whole)
 
 
+def test_how_many_states_of_the_code_made_the_records(whole, change):
+    told = "18 records; states of the code that made them: {}, and {} records tell none"
+    assert benchmark.made_by(INVERTED_PENDULUM, whole) == told.format(1, 0)
+    record = json.loads((whole / "07_benchmark_inverted_pendulum_rivals_seed1.json").read_text())
+    change(json.dumps(record | {"source": "other"}))
+    assert benchmark.made_by(INVERTED_PENDULUM, whole) == told.format(2, 0)
+    del record["source"]
+    change(json.dumps(record))
+    assert benchmark.made_by(INVERTED_PENDULUM, whole) == told.format(1, 1)
+
+
 def no_worth(record):
     del record["results"]["scores"]["MSRD, nothing"]["500000"]["worth"]
 
