@@ -82,13 +82,6 @@ class Diversity:
 
 
 @dataclass(frozen=True)
-class Exploration:
-    """How learners explore: clones disturbed by each of these levels (``Actor.disturbed``: noise, drift)."""
-
-    levels: tuple[tuple[float, float], ...] = ((1.0, 0.0), (3.0, 0.0), (10.0, 0.0))
-
-
-@dataclass(frozen=True)
 class Domain:
     """A task with a fixed horizon that never ends early."""
 
@@ -110,7 +103,8 @@ class Domain:
     simulator: Simulator
     poor_return: float = float("inf")  # who fails and returns less has hardly begun to learn
     comparison: StateComparison = StateComparison()
-    exploration: Exploration = Exploration()
+    exploration: tuple[tuple[float, float], ...] = ((1.0, 0.0), (3.0, 0.0), (10.0, 0.0))  # learners explore
+    # as clones that are disturbed by each of these levels (``Actor.disturbed``: noise, drift)
     drawing: Drawing | None = None
     diversity: Diversity | None = None
 

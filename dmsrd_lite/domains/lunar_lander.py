@@ -2,15 +2,7 @@
 
 import numpy as np
 
-from dmsrd_lite.domains.domain import (
-    Diversity,
-    Domain,
-    Drawing,
-    Exploration,
-    Population,
-    Simulator,
-    StateComparison,
-)
+from dmsrd_lite.domains.domain import Diversity, Domain, Drawing, Population, Simulator, StateComparison
 
 
 class LanderBatch:
@@ -129,7 +121,7 @@ LUNAR_LANDER = Domain(
         alike=on_its_legs,
         others_at_least=1.0,
     ),
-    exploration=Exploration(((10.0, 0.0), (30.0, 0.0), (1.0, 2.0))),  # only failures: near misses hurt R_Task
+    exploration=((10.0, 0.0), (30.0, 0.0), (1.0, 2.0)),  # only failures: near misses hurt R_Task
     drawing=Drawing(draw, phase_axes=(0, 1), reward_axes=(0, 1), reward_window=((-1.0, 1.0), (-0.2, 1.5))),
     diversity=Diversity(
         features, ("x", "y", "time"), (Population(_UNITS, last_sigma=0.2),), Population(_UNITS), describe

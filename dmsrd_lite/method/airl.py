@@ -49,7 +49,7 @@ class AIRLSettings:
     cloning_steps: int = 2000
     coverage: str = "half"  # exploratory rollouts: half of D's samples, or "once" in the replay, or "none"
     coverage_episodes: int = 2  # of the untrained policy and at each level of the clone (of it, without one)
-    coverage_levels: tuple[tuple[float, float], ...] = ()  # as ``Exploration.levels``; (): the domain's
+    coverage_levels: tuple[tuple[float, float], ...] = ()  # as ``Domain.exploration``; (): the domain's
     discriminator_steps: int = 12
     discriminator_batch: int = 256  # demonstration samples per strategy and step, and as many others
     discriminator_rate: float = 3e-3
@@ -342,7 +342,7 @@ class AIRL:
         Without a clone it is the untrained policy that is made worse.
         """
         s, rng = self.settings, np.random.default_rng([*self.seed, 6])
-        levels, known = s.coverage_levels or self.domain.exploration.levels, self.clone or self.untrained
+        levels, known = s.coverage_levels or self.domain.exploration, self.clone or self.untrained
         actor = Actor.joined([self.untrained, *(known.disturbed(*level, rng) for level in levels)])
         data = rollout(self.domain, actor, s.coverage_episodes, [*self.seed, 4], horizon=self.horizon)
         self.steps += data.n_steps // len(self.x)

@@ -13,7 +13,7 @@ from dmsrd_lite.domains import InputError
 from dmsrd_lite.learning.networks import Actor
 from dmsrd_lite.method.airl import AIRL, AIRLSettings
 from dmsrd_lite.method.divergence import policy_divergences, steps_measured
-from dmsrd_lite.method.kl_threshold import calibrate_threshold
+from dmsrd_lite.method.kl_threshold import reference_divergence
 from dmsrd_lite.method.msrd import MSRDSettings
 from dmsrd_lite.method.policy_mixture import MixtureSettings, action_loss, likeliest_weights, search_mixture
 from dmsrd_lite.method.rewards import Rewards
@@ -120,7 +120,8 @@ def learn_one(state: State, new: DemonstrationSet, settings: DMSRDSettings) -> S
     state, seed = replace(state, alpha=s.msrd.alpha, form=s.form), [state.seed, 102, n]
     steps = {"search": 0, "airl": 0}  # search: of all rollouts whose KL decides something
     candidate = cache(partial(_candidate, state, new, s, [*seed, 2]))  # AIRL on tau_i, made when asked for
-    eps, reference = calibrate_threshold(new, candidate, s, [*seed, 7])
+    reference = reference_divergence(new, candidate, s, [*seed, 7])
+    eps = s.kl_threshold or reference + s.kl_margin
     if new.domain.comparison.matched_starts and not s.kl_threshold:  # the reference was flown
         steps["search"] += steps_measured(new, s.mixture.final_rollouts)
     kl_mix = kl_new = shortfall = float("inf")

@@ -13,14 +13,6 @@ if TYPE_CHECKING:
     from dmsrd_lite.method.dmsrd import DMSRDSettings
 
 
-def calibrate_threshold(
-    new: DemonstrationSet, candidate: Callable[[], AIRL], settings: "DMSRDSettings", seed: list[int]
-) -> tuple[float, float]:
-    """eps for a demonstration, given or ``kl_margin`` above the reference, and the reference."""
-    reference = reference_divergence(new, candidate, settings, seed)
-    return settings.kl_threshold or reference + settings.kl_margin, reference
-
-
 def reference_divergence(
     new: DemonstrationSet, candidate: Callable[[], AIRL], settings: "DMSRDSettings", seed: list[int]
 ) -> float:

@@ -562,9 +562,9 @@ def lost(found: Benchmark, entries: Sequence[Entry], settings: BenchmarkLesson) 
             if asked and not loses(one, control, metric):
                 return "the missing steps are enough"
         elif "AIRL Single" in there and loses(there["AIRL Single"], other, metric):
-            return "AIRL: AIRL Single loses it, too"
+            return "AIRL Single loses it, too"
         if metric in METRICS and not of_strategies(one, other, metric):
-            return "mixtures: strategies do not lose it"
+            return "strategies do not lose it, mixtures do"
         return "not known"
 
     titles, lines = {m: title for m, (title, _) in METRICS.items()} | {"pearson": "Pearson of R_Task"}, []

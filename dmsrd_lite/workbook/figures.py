@@ -8,7 +8,7 @@ import numpy as np
 import seaborn
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, ScalarFormatter
 
 from dmsrd_lite.domains import Domain
 from dmsrd_lite.domains.domain import Drawing, InputError
@@ -204,17 +204,37 @@ def plot_decisions(
 
 def plot_stream(records: Sequence[dict], floor: np.ndarray, ax: Axes | None = None) -> Axes:
     """KL at arrival of what explains each demonstration of a stream (records), by the branch taken."""
-    ax = ax or plt.gca()
-    x, branches = np.arange(len(records)), np.array([r["branch"] for r in records])
+    x = np.arange(len(records))
     kl = np.array([r["kl_new"] if r["branch"] == NEW_STRATEGY else r["kl_mix"] for r in records])
-    for branch, (marker, color) in BRANCHES.items():
-        some = branches == branch
-        name = f"{branch} ({some.sum()})"
-        ax.plot(x[some], kl[some], marker, color=color, label=name, linestyle="none", markersize=4)
+    ax = _by_branch(records, kl, ax)
     ax.hlines(floor, x - 0.4, x + 0.4, color="black", label="floor")
-    ax.plot(x, [r["threshold"] for r in records], color=INKS[3], label="threshold", linewidth=0.8)
+    ax.plot(x, [r["threshold"] for r in records], color=INKS[3], label=r"$\epsilon$", linewidth=0.8)
     ax.set(ylabel="KL (nats)")
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=5)
+    return ax
+
+
+def plot_shortfalls(records: Sequence[dict], margin: float, ax: Axes | None = None) -> Axes:
+    """Shortfall of each demonstration of a stream (``dmsrd.learn``) on arrival, by the branch taken, and the
+    margin that decides; the first, and a stream that did not ask, have none."""
+    asked = [r.get("shortfall") for r in records]
+    finite = [np.nan if s is None or not np.isfinite(s) else s for s in asked]
+    ax = _by_branch(records, np.array(finite), ax)
+    ax.axhline(margin, color=INKS[3], linewidth=1.2, linestyle="--")
+    ax.set_yscale("symlog", linthresh=margin)
+    ax.set_ylim(min(-margin / 2, 1.5 * np.nanmin(finite)), 2 * max(margin, np.nanmax(finite)))
+    ax.yaxis.set_major_locator(FixedLocator([0, margin, *(t for t in (0.1, 1, 10) if t > 2 * margin)]))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.set(ylabel="shortfall\n(nats)")
+    return ax
+
+
+def _by_branch(records: Sequence[dict], values: np.ndarray, ax: Axes | None) -> Axes:
+    ax, branches = ax or plt.gca(), np.array([r["branch"] for r in records])
+    for branch, (marker, color) in BRANCHES.items():
+        x = np.flatnonzero(branches == branch)
+        style: dict[str, Any] = {"color": color, "linestyle": "none", "markersize": 4}
+        ax.plot(x, values[x], marker, label=f"{branch} ({len(x)})", **style)
     return ax
 
 

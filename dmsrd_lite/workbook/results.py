@@ -35,17 +35,9 @@ SHOWN = {
     "weight_error": "error of the weights",
 }
 NO_METRICS = (
-    "curve",
-    "curves",
-    "decisions",
-    "branches",
-    "pure",
-    "weights",
-    "paid",
-    "paid_shown",
-    "order",
-    "kept",
-)
+    "curve", "curves", "decisions", "branches", "pure", "weights", "paid", "paid_shown",
+    "order", "kept", "kl_of_kept", "looks", "threshold", "searched_again",
+)  # fmt: skip
 COLUMNS = ("record", "lesson", "domain", "seed", "method", "metric", "value")
 
 

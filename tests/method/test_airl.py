@@ -67,7 +67,7 @@ def test_a_tiny_run_counts_steps_and_is_deterministic(change, small_set):
         learner = AIRL(shown, settings, 3)
         records = list(learner.train())
         runs.append(learner.networks())
-    levels = settings.coverage_levels or small_set.domain.exploration.levels
+    levels = settings.coverage_levels or small_set.domain.exploration
     explored = (1 + len(levels)) * 50 if settings.coverage != "none" else 0
     assert [r["steps"] for r in records] == [explored + 50, explored + 100]
     for r in records:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from records import stored
 
+from dmsrd_lite.beyond.spanning_set import spanning_set
 from dmsrd_lite.demonstrators import people
 from dmsrd_lite.domains import DOMAINS
 from dmsrd_lite.evaluation import comparison, searches
@@ -16,6 +17,8 @@ from dmsrd_lite.learning.networks import under
 from dmsrd_lite.learning.policy_optimization import train_policies
 from dmsrd_lite.method.airl import clone_demonstrations
 from dmsrd_lite.method.between_class_discrimination import recognized
+from dmsrd_lite.method.divergence import policy_divergences
+from dmsrd_lite.method.dmsrd import NEW_STRATEGY
 from dmsrd_lite.method.policy_mixture import Mixtures
 from dmsrd_lite.method.rewards import Rewards
 from dmsrd_lite.workbook import benchmark, presets
@@ -254,3 +257,35 @@ def test_the_hundred_score_again_as_recorded(name):
     acting = Mixtures(everybody.actor, everybody.weights[found["arrival"]])
     takes = fresh_takes(acting, domain, seed, (3,))
     assert_known(learned.rewards, takes, known["pure"], known["recognized_fresh"], label)
+
+
+@pytest.mark.verify
+@pytest.mark.parametrize("name", [name for name in TRIALS if "pendulum_ours" in name])
+def test_the_smaller_set_explains_whom_all_strategies_explained(name):
+    found, _, _, learned, users, domain, seed = lived(name)
+    eps, mixture = [r["threshold"] for r in found["records"]], presets.METHODS[domain.name].dmsrd.mixture
+    actor = learned.policies.actor()
+    least = spanning_set(actor, users, learned.weights, eps, mixture, seed)
+    assert abs(len(least.kept) - len(found["spanning"]["kept"])) <= 1
+    both = learned.actor(), Mixtures(actor.select([*least.kept]), least.weights)
+    before, after = ((policy_divergences(some, users, [seed, 77]) > eps).sum() for some in both)
+    assert after <= before + 5  # a KL scatters around eps
+
+
+@pytest.mark.parametrize("name", [name for name in of("08") if "_orders_" in name])
+def test_recorded_orders_are_orders_and_their_counts_agree(name):
+    orders = stored.record_of(name)[0]["results"]["orders"]
+    assert len({tuple(o["order"]) for o in orders}) == len(orders) == 20
+    for o in orders:
+        assert sorted(o["order"]) == list(range(25))
+        assert o["pure"] == [i for i, b in enumerate(o["branches"]) if b == NEW_STRATEGY]
+        assert o["looks"][-1]["strategies"] == len(o["pure"]) >= len(o["kept"])
+        before, after = (np.greater(o[k], o["threshold"]).sum() for k in ("divergence", "kl_of_kept"))
+        assert after <= before + 3  # a KL scatters around eps
+
+
+@pytest.mark.parametrize("name", [name for name in of("08") if "_thousand_" in name])
+def test_a_checkpoint_of_a_thousand_grows_by_its_weights_alone(name):
+    found = stored.record_of(name)[0]["results"]
+    assert [line[0] for line in found["lived"]] == list(range(1, 1001))
+    assert np.diff(found["sizes"]) == pytest.approx(100 * 8 * len(found["pure"]), abs=16)

@@ -305,7 +305,7 @@ def test_why_a_row_is_lost():
     found = benchmark.collect(INVERTED_PENDULUM, iter(trials))
     told = benchmark.lost(found, benchmark.entries(found, LESSON), LESSON)
     assert told.values.tolist() == [
-        ["MSRD", "return", "AIRL: AIRL Single loses it, too"],
+        ["MSRD", "return", "AIRL Single loses it, too"],
         ["MSRD", "KL", "not known"],
         ["MSRD", "Pearson of R_Task", "not BCD: without it, too"],
     ]

@@ -104,6 +104,15 @@ def test_decisions_and_streams_show_what_was_measured(ax):
     assert points["mixture (1)"] == ([1], [0.8])
 
 
+def test_shortfalls_stand_over_the_margin_that_decides(ax):
+    asked = [{**r, "shortfall": s} for r, s in zip(RECORDS, (None, 0.01, 0.7), strict=True)]
+    figures.plot_shortfalls(asked, 0.3, ax)
+    lines = {line.get_label(): np.asarray(line.get_ydata(), dtype=float) for line in ax.lines}
+    assert lines["new strategy (2)"] == pytest.approx([np.nan, 0.7], nan_ok=True), "the first was not asked"
+    assert list(lines["mixture (1)"]) == [0.01]
+    assert [0.3, 0.3] in [list(line) for line in lines.values()]
+
+
 def test_a_film_and_its_video(domain, small_set):
     frames = videos.film(domain, np.repeat(small_set.observations[:, 0], 2, 0)[:, :21], columns=3, every=5)
     assert frames.shape == (5, 2 * 120, 3 * 240, 3), "four people, three in a row"

@@ -36,7 +36,7 @@ def test_every_lesson_has_quick_and_full_in_both_domains(lesson, domain):
 
 def test_every_notebook_has_settings_and_nothing_else_has():
     assert {path.stem for path in lessons()} == set(LESSONS) >= set(KNOBS)
-    for table in (presets.TRAINING, presets.DEMONSTRATORS, presets.TEST_SETS, presets.METHODS):
+    for table in (presets.DEMONSTRATORS, presets.TEST_SETS, presets.METHODS):
         assert list(table) == list(DOMAINS)
     with pytest.raises(InputError, match="unknown preset 'huge': expected one of quick, full"):
         choose("02_airl", "inverted_pendulum", "huge")
