@@ -216,13 +216,12 @@ def plot_stream(records: Sequence[dict], floor: np.ndarray, ax: Axes | None = No
 
 def plot_shortfalls(records: Sequence[dict], margin: float, ax: Axes | None = None) -> Axes:
     """Shortfall of each demonstration of a stream (``dmsrd.learn``) on arrival, by the branch taken, and the
-    margin that decides; the first, and a stream that did not ask, have none."""
-    asked = [r.get("shortfall") for r in records]
-    finite = [np.nan if s is None or not np.isfinite(s) else s for s in asked]
-    ax = _by_branch(records, np.array(finite), ax)
+    margin that decides; the first has none."""
+    asked = np.array([r["shortfall"] for r in records], dtype=float)  # None becomes NaN
+    ax = _by_branch(records, asked, ax)
     ax.axhline(margin, color=INKS[3], linewidth=1.2, linestyle="--")
     ax.set_yscale("symlog", linthresh=margin)
-    ax.set_ylim(min(-margin / 2, 1.5 * np.nanmin(finite)), 2 * max(margin, np.nanmax(finite)))
+    ax.set_ylim(min(-margin / 2, 1.5 * np.nanmin(asked)), 2 * max(margin, np.nanmax(asked)))
     ax.yaxis.set_major_locator(FixedLocator([0, margin, *(t for t in (0.1, 1, 10) if t > 2 * margin)]))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.set(ylabel="shortfall\n(nats)")
